@@ -1,0 +1,231 @@
+"""The robot file: one TOML, read strictly into frozen types that every other part conforms to.
+
+An unknown key, a missing key, a wrong type or a value out of range ends in one line that names the place in the
+file, what was found and what was expected (`RobotFileError`, exit code 64). Units stand in the names.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
+from msgspec import Meta
+
+from modsoft.runtime.errors import RobotFileError
+
+
+class Kind(NamedTuple):
+    """What is fixed by the way a module is driven; `state` names the parts of the configuration in feature order."""
+
+    state: tuple[str, ...]
+    action: tuple[str, ...]
+    channels: int  # cables or chambers a module
+
+
+KINDS: dict[str, Kind] = {
+    "cable": Kind(state=("v_z", "v_x", "v_y"), action=("a_0", "a_1"), channels=4),
+    "pneumatic": Kind(state=("v_x", "v_y"), action=("a_0",), channels=2),
+}
+
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)]
+Bar = Annotated[float, Meta(ge=0.0, le=10.0)]
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the robot file: every key is known, nothing changes after reading."""
+
+
+class Identity(Section):
+    """`[robot]`"""
+
+    name: Name
+    kind: Literal["cable", "pneumatic"]
+    modules: Annotated[int, Meta(ge=2, le=64)]  # one module has no label: eq. (1) divides by N - 1
+
+
+class Valve(Section):
+    """`[valve]`: the pressure regulators. Activation 0 is `p_min_bar`, activation 1 is `p_max_bar` (section 3.1)."""
+
+    model: str
+    full_scale_bar: Annotated[float, Meta(gt=0.0, le=10.0)]  # off the label: 10 V mean another pressure on each type
+    signal: str
+    p_min_bar: Bar = 0.08
+    p_max_bar: Bar = 0.35
+
+
+class Chamber(Section):
+    """`[[chambers]]`: which valve channel inflates which chamber, and what corrects that chamber's pressure.
+
+    side `+` inflates for a_0 > 0, `-` for a_0 < 0 (eq. 3); pressure sent = gain * pressure + offset_bar.
+    """
+
+    module: Annotated[int, Meta(ge=1)]
+    side: Literal["+", "-"]
+    channel: Annotated[int, Meta(ge=0, le=11)]
+    gain: Annotated[float, Meta(gt=0.0, le=2.0)] = 1.0
+    offset_bar: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
+
+
+class Limits(Section):
+    """`[limits]`: what the loop never exceeds, and how long it goes on without a good frame."""
+
+    largest_actuation_step: Annotated[float, Meta(gt=0.0, le=2.0)] = 2.0
+    slew_bar_per_s: Annotated[float, Meta(gt=0.0, le=50.0)] = 2.0
+    tracker_age_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.4
+    invalid_frames: Annotated[int, Meta(ge=1, le=100)] = 3
+
+
+class Tracker(Section):
+    """`[tracker]`: source and its port; `tools` are the tool definition files, base first, then module 1 to N."""
+
+    source: Literal["ndi", "igtl", "replay"] = "ndi"
+    type: Literal["polaris", "vega", "aurora"] = "polaris"
+    port: str = ""
+    tools: tuple[str, ...] = ()
+
+
+class Serial(Section):
+    """`[serial]`: the board's port (empty: told on the command line)."""
+
+    port: str = ""
+    baud: Literal[115200, 250000, 500000, 1000000] = 250000
+
+
+class Loop(Section):
+    """`[loop]`: control rate, and the task that runs when none is told."""
+
+    hz: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.5
+    task: str = ""
+
+    @property
+    def period_s(self) -> float:
+        """Control period, seconds."""
+        return 1.0 / self.hz
+
+
+class Robot(Section):
+    """A whole robot file. `kind` gives the state and action sizes; a cable robot is simulated, so it has no valves."""
+
+    robot: Identity
+    loop: Loop
+    valve: Valve | None = None
+    chambers: tuple[Chamber, ...] = ()
+    limits: Limits = Limits()
+    tracker: Tracker = Tracker()
+    serial: Serial = Serial()
+
+    @property
+    def name(self) -> str:
+        return self.robot.name
+
+    @property
+    def modules(self) -> int:
+        """Number of modules N."""
+        return self.robot.modules
+
+    @property
+    def kind(self) -> Kind:
+        return KINDS[self.robot.kind]
+
+    @property
+    def state_size(self) -> int:
+        return len(self.kind.state)
+
+    @property
+    def action_size(self) -> int:
+        return len(self.kind.action)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain Python values, for a checkpoint, ONNX metadata or a log."""
+        return msgspec.to_builtins(self)
+
+
+def names() -> list[str]:
+    """The robots that ship with the runtime."""
+    folder = resources.files("modsoft.runtime") / "robots"
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def text_of(name: str) -> str:
+    """The robot file of a shipped robot, comments and all, to start one's own from."""
+    if name not in names():
+        raise RobotFileError(f"no robot is called {name!r}; the ones that ship are {', '.join(names())}")
+    return (resources.files("modsoft.runtime") / "robots" / f"{name}.toml").read_text(encoding="utf-8")
+
+
+def load(file_or_name: str | Path) -> Robot:
+    """Reads a robot file, or a shipped robot by its name. A file wins where both exist."""
+    path = Path(file_or_name)
+    if path.is_file():
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise RobotFileError(f"{path}: cannot be read as UTF-8 text ({error})") from error
+        return parse(text, str(path))
+    if str(file_or_name) in names():
+        return parse(text_of(str(file_or_name)), str(file_or_name))
+    raise RobotFileError(
+        f"no robot file {str(file_or_name)!r} here, and no shipped robot of that name; give a file or one of "
+        f"{', '.join(names())} (modsoft-runtime --print-robot pneumatic-3 > robot.toml makes one to start from)"
+    )
+
+
+def parse(text: str, where: str = "robot file") -> Robot:
+    """Robot file text to `Robot`; `where` is named in the errors."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise RobotFileError(f"{where}: not valid TOML: {error}") from error
+    return from_dict(table, where)
+
+
+def from_dict(table: dict[str, Any], where: str = "robot") -> Robot:
+    """Plain values (TOML, a checkpoint, ONNX metadata) to `Robot`, checked as strictly as the file."""
+    try:
+        robot = msgspec.convert(table, Robot)
+    except msgspec.ValidationError as error:
+        raise RobotFileError(f"{where}: {error}") from error
+    _check(robot, where)
+    return robot
+
+
+def _check(robot: Robot, where: str) -> None:
+    """What types cannot say: keys that belong together."""
+
+    def refuse(found: str, expected: str) -> None:
+        raise RobotFileError(f"{where}: {found}; expected {expected}")
+
+    count = robot.modules
+    if robot.tracker.tools and len(robot.tracker.tools) != count + 1:
+        refuse(f"tracker.tools has {len(robot.tracker.tools)} entries", f"{count + 1}: base, then modules 1 to {count}")
+    if robot.robot.kind == "cable":
+        if robot.valve is not None or robot.chambers:
+            refuse("a cable robot with [valve] or [[chambers]]", "neither: cable robots are simulated")
+        return
+
+    valve = robot.valve
+    if valve is None:
+        refuse("a pneumatic robot without [valve]", "one, with full_scale_bar from the valve's label")
+        return
+    if not valve.p_min_bar < valve.p_max_bar <= valve.full_scale_bar:
+        refuse(
+            f"valve pressures p_min_bar {valve.p_min_bar}, p_max_bar {valve.p_max_bar}, "
+            f"full_scale_bar {valve.full_scale_bar}",
+            "p_min_bar < p_max_bar <= full_scale_bar",
+        )
+    wanted = Counter((module, side) for module in range(1, count + 1) for side in "+-")
+    found = Counter((chamber.module, chamber.side) for chamber in robot.chambers)
+    if found != wanted:
+        wrong = sorted((found - wanted) + (wanted - found))
+        refuse(
+            f"[[chambers]] of {count} modules wrong at {', '.join(f'module {m} side {s}' for m, s in wrong)}",
+            "each module from 1 with one chamber '+' and one '-'",
+        )
+    channels = Counter(chamber.channel for chamber in robot.chambers)
+    twice = sorted(channel for channel, uses in channels.items() if uses > 1)
+    if twice:
+        refuse(f"valve channel {twice[0]} is given to two chambers", "a channel of its own for each")

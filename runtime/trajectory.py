@@ -1,0 +1,111 @@
+"""The tasks: desired configurations over the control steps, from the paper's supplement (S1 to S5).
+
+The supplement prints 3.24 degrees for `down` with two modules, which contradicts its own text ("about 30 degrees",
+angles that sum to zero); 32.4 is taken.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.errors import UsageError
+from modsoft.runtime.robot import Robot
+
+Array = NDArray[np.float64]
+
+SIMULATED_STEPS = 250
+REAL_STEPS = 200
+
+# Per task and number of modules: smallest v_z of each module, base first (A); v_z and amplitude (B); both (C).
+SPIRAL_V_Z = {4: [0.975, 0.850, 0.725, 0.625], 6: [0.998, 0.995, 0.950, 0.850, 0.800, 0.650]}
+CIRCLE_V_Z = {4: [0.998, 0.998, 0.996, 0.600], 6: [0.999, 0.999, 0.999, 0.998, 0.995, 0.708]}
+CIRCLE_SIGN = {4: [1, 1, 1, -1], 6: [1, 1, 1, 1, -1, -1]}
+BEND_V_Z = {4: [0.941, 0.998, 0.897, 0.650], 6: [0.999, 0.996, 0.985, 0.975, 0.925, 0.600]}
+BEND_SIGN = {4: [1, 1, 1, -1], 6: [1, 1, 1, 1, 1, -1]}
+# Largest angles of the planar tasks, degrees.
+EDGE_DEG = {3: [5.4, 18.0, 90.0], 2: [21.6, 72.0]}
+DOWN_DEG = {3: [3.6, 36.0, -39.6], 2: [32.4, -32.4]}
+
+
+def _turn(phase: Array, v_z: Array, sign: Array) -> Array:
+    """Configurations (steps, N, 3) turning about z: phase (steps,) rad, v_z (steps, N), sign (N,)."""
+    side = sign * np.sqrt(1.0 - v_z**2)
+    return np.stack([np.sin(phase)[:, None] * side, np.cos(phase)[:, None] * side, v_z], axis=-1)
+
+
+def task_a(v_z_min: list[float]) -> Array:
+    """S1: all modules turn once while they bend ever further."""
+    t = np.arange(SIMULATED_STEPS) / SIMULATED_STEPS
+    v_z = 1.0 - (1.0 - np.asarray(v_z_min)) * t[:, None]
+    return _turn(2 * np.pi * t, v_z, np.ones(len(v_z_min)))
+
+
+def task_b(v_z: list[float], sign: list[int]) -> Array:
+    """S2: one turn at constant bend; the first step is a jump from rest."""
+    t = np.arange(SIMULATED_STEPS) / SIMULATED_STEPS
+    return _turn(2 * np.pi * t, np.broadcast_to(v_z, (SIMULATED_STEPS, len(v_z))), np.asarray(sign))
+
+
+def task_c(v_z_min: list[float], sign: list[int]) -> Array:
+    """S3, S4: 50 steps of bending in y, then one turn."""
+    t = np.arange(SIMULATED_STEPS)
+    v_z = 1.0 - (1.0 - np.asarray(v_z_min)) * np.minimum(t / 50, 1.0)[:, None]
+    return _turn(2 * np.pi * np.maximum(t - 50, 0) / 200, v_z, np.asarray(sign))
+
+
+def task_planar(largest_deg: list[float]) -> Array:
+    """S5: every angle rises to its largest value, crosses to the opposite one, and comes back."""
+    t = np.arange(REAL_STEPS)
+    share = np.where(t < 50, t / 50, np.where(t < 150, 2 - t / 50, t / 50 - 4))
+    return from_angles_deg(share[:, None] * np.asarray(largest_deg))
+
+
+def available(kind: str, modules: int) -> list[str]:
+    """Names of the tasks that the supplement defines for such a robot."""
+    if kind == "cable":
+        return ["A", "B", "C"] if modules in SPIRAL_V_Z else []
+    return ["edge", "down"] if modules in EDGE_DEG else []
+
+
+def task(name: str, kind: str, modules: int) -> Array:
+    """Desired configurations (steps, N, 3), [v_x, v_y, v_z]; row k is the target of control step k."""
+    if name not in available(kind, modules):
+        known = ", ".join(available(kind, modules)) or "none by name"
+        raise UsageError(
+            f"no task {name!r} for a {kind} robot of {modules} modules; known: {known}; or give a .npy file with "
+            f"desired configurations (steps, {modules}, 3), [v_x, v_y, v_z]"
+        )
+    match name:
+        case "A":
+            return task_a(SPIRAL_V_Z[modules])
+        case "B":
+            return task_b(CIRCLE_V_Z[modules], CIRCLE_SIGN[modules])
+        case "C":
+            return task_c(BEND_V_Z[modules], BEND_SIGN[modules])
+        case "edge":
+            return task_planar(EDGE_DEG[modules])
+        case _:
+            return task_planar(DOWN_DEG[modules])
+
+
+def load_task(name_or_file: str, robot: Robot) -> Array:
+    """A task by its name, or from a .npy file of unit vectors (steps, N, 3)."""
+    if not name_or_file.endswith(".npy"):
+        return task(name_or_file, robot.robot.kind, robot.modules)
+    if not Path(name_or_file).is_file():
+        raise UsageError(f"no task file {name_or_file!r}; give an existing .npy file or a task's name")
+    try:
+        desired = np.load(name_or_file, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"task file {name_or_file}: not a readable .npy array ({error})") from error
+    if desired.ndim != 3 or desired.shape[1:] != (robot.modules, 3) or not len(desired):
+        raise UsageError(
+            f"task file {name_or_file}: found shape {desired.shape}, expected (steps, {robot.modules}, 3)"
+        )
+    if desired.dtype.kind != "f" or not np.allclose(np.linalg.norm(desired, axis=-1), 1.0, atol=1e-6):
+        raise UsageError(f"task file {name_or_file}: every [v_x, v_y, v_z] must be a unit vector of floats")
+    return desired.astype(np.float64)

@@ -1,0 +1,70 @@
+"""The checkpoint `model.pt`: a dict of tensors and plain Python values that says all about the model it holds.
+
+    schema      int, SCHEMA
+    robot       the robot file of the data set, as plain values
+    network     {"name": "bilstm", "feature_size", "action_size", "layers", "hidden", "dropout", "history"}
+    features    ordered names of the F features
+    weights     state dict
+    provenance  {"data_sha256", "seed", "code_version", "date", "split", "samples", "iterations", "errors_percent", ...}
+    resume      what training needs to go on (optimiser, random states); absent in a finished model
+
+It is read with `weights_only=True`: a model file from a stranger runs no code.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from modsoft.runtime.errors import ModelError
+from modsoft.training.networks import BiLSTM
+
+SCHEMA = 1
+KEYS = ("schema", "robot", "network", "features", "weights", "provenance")
+
+
+def save(checkpoint: dict[str, Any], path: Path) -> None:
+    """Writes to a temporary name beside `path` and renames, so that a kill leaves the old file or the new one."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        torch.save(checkpoint, temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Reads a checkpoint; `ModelError` says what was found when it is none."""
+    if not path.is_file():
+        raise ModelError(f"no model file {path}; modsoft-train --out {path} makes one")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, EOFError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise ModelError(f"{path}: not a checkpoint of modsoft-train ({first})") from error
+    if not isinstance(checkpoint, dict):
+        raise ModelError(f"{path}: holds a {type(checkpoint).__name__}, expected a checkpoint of modsoft-train")
+    missing = [key for key in KEYS if key not in checkpoint]
+    if missing:
+        raise ModelError(f"{path}: no {', '.join(missing)} in it, expected a checkpoint of modsoft-train")
+    if checkpoint["schema"] != SCHEMA:
+        raise ModelError(f"{path}: schema {checkpoint['schema']}, this version reads {SCHEMA}; train it again")
+    return checkpoint
+
+
+def network_of(checkpoint: dict[str, Any]) -> BiLSTM:
+    """The network with its weights, in evaluation mode."""
+    sizes = checkpoint["network"]
+    network = BiLSTM(
+        sizes["feature_size"], sizes["action_size"], sizes["layers"], sizes["hidden"], sizes.get("dropout", 0.0)
+    )
+    try:
+        network.load_state_dict(checkpoint["weights"])
+    except RuntimeError as error:
+        raise ModelError(f"the checkpoint's weights do not fit its own description: {error}") from error
+    return network.eval()
