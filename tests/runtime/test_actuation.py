@@ -1,0 +1,56 @@
+"""Eq. (3), the limits on the actuation, and what the board is sent."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from modsoft.runtime import actuation, robot
+
+ROBOT = robot.load("pneumatic-3")
+ACTIONS = arrays(np.float64, (3, 1), elements=st.floats(-1, 1))
+
+
+def test_cables_pull_in_the_order_0_180_90_270_degrees():
+    assert np.array_equal(actuation.activations([[0.3, -0.7]]), [[0.3, 0.0, 0.0, 0.7]])
+
+
+@given(ACTIONS)
+def test_opposite_chambers_never_push_together(action):
+    pair = actuation.activations(action)
+    assert np.all(np.min(pair, axis=-1) == 0)
+    assert np.array_equal(pair[:, :1] - pair[:, 1:], action)
+
+
+def test_pressure_is_linear_in_the_activation():
+    pressures = actuation.pressures_bar(ROBOT, np.array([[0.0], [1.0], [-0.5]]))
+    np.testing.assert_allclose(pressures, [[0.08, 0.08], [0.35, 0.08], [0.08, 0.215]])
+
+
+@given(ACTIONS, ACTIONS, st.floats(0.01, 2))
+def test_limited_stays_within_the_step_and_the_range(wanted, before, step):
+    out = actuation.limited(wanted * 3, before, step)
+    assert np.all(np.abs(out) <= 1)
+    assert np.all(np.abs(out - before) <= step + 1e-12)
+
+
+def test_a_reachable_actuation_is_not_changed():
+    assert np.array_equal(actuation.limited([[0.5]], [[0.4]], 0.2), [[0.5]])
+
+
+def test_channels_carry_gain_and_offset_and_nothing_else():
+    table = ROBOT.to_dict()
+    table["chambers"][0].update(channel=10, gain=0.5, offset_bar=0.01)
+    out = actuation.channel_pressures_bar(robot.from_dict(table), np.array([[1.0], [-1.0], [0.0]]))
+    expected = np.zeros(12)
+    expected[[10, 1, 2, 3, 4, 5]] = [0.5 * 0.35 + 0.01, 0.08, 0.08, 0.35, 0.08, 0.08]
+    np.testing.assert_allclose(out, expected)
+
+
+def test_no_correction_exceeds_the_largest_pressure():
+    table = ROBOT.to_dict()
+    table["chambers"][0].update(gain=2.0)
+    table["chambers"][1].update(offset_bar=-0.1)
+    out = actuation.channel_pressures_bar(robot.from_dict(table), np.array([[1.0], [0.0], [0.0]]))
+    assert out[0] == 0.35
+    assert out[1] == 0.0

@@ -1,0 +1,103 @@
+"""The robot file: what is accepted, and that every mistake is named."""
+
+import dataclasses
+
+import msgspec
+import pytest
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.errors import RobotFileError
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "modules", "state", "action"),
+    [("cable-4", "cable", 4, 3, 2), ("cable-6", "cable", 6, 3, 2), ("pneumatic-2", "pneumatic", 2, 2, 1),
+     ("pneumatic-3", "pneumatic", 3, 2, 1)],
+)  # fmt: skip
+def test_shipped_robots(name, kind, modules, state, action):
+    robot = robots.load(name)
+    assert (robot.name, robot.robot.kind, robot.modules) == (name, kind, modules)
+    assert (robot.state_size, robot.action_size) == (state, action)
+
+
+def test_exactly_these_four_ship():
+    assert robots.names() == ["cable-4", "cable-6", "pneumatic-2", "pneumatic-3"]
+
+
+def test_printed_robot_can_be_read_from_a_file(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(robots.text_of("pneumatic-3"))
+    assert robots.load(path) == robots.load("pneumatic-3")
+
+
+def test_a_file_wins_over_a_shipped_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cable-4").write_text(robots.text_of("cable-6"))
+    assert robots.load("cable-4").modules == 6
+
+
+def test_dict_round_trip():
+    for name in robots.names():
+        robot = robots.load(name)
+        assert robots.from_dict(robot.to_dict()) == robot
+
+
+def test_frozen():
+    with pytest.raises((AttributeError, dataclasses.FrozenInstanceError)):
+        robots.load("cable-4").loop.hz = 3.0
+
+
+PNEUMATIC = robots.text_of("pneumatic-3")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (PNEUMATIC.replace("hz = 2.5", "hzz = 2.5"), "hzz"),
+        (PNEUMATIC.replace("hz = 2.5", 'hz = "fast"'), r"Expected `float`, got `str` - at `\$.loop.hz`"),
+        (PNEUMATIC.replace("hz = 2.5", "hz = 0.0"), r"\$.loop.hz"),
+        (PNEUMATIC.replace('kind = "pneumatic"', 'kind = "hydraulic"'), "hydraulic"),
+        (PNEUMATIC.replace("modules = 3", "modules = 1"), r"\$.robot.modules"),
+        (PNEUMATIC.replace("modules = 3", "modules = 2"), "module 3 side"),
+        (PNEUMATIC.replace("modules = 3", "modules = 4"), "module 4 side"),
+        (PNEUMATIC.replace("full_scale_bar = 3.0 ", "# "), "full_scale_bar"),
+        (PNEUMATIC.replace("full_scale_bar = 3.0", "full_scale_bar = 0.3"), "p_min_bar < p_max_bar <= full_scale_bar"),
+        (PNEUMATIC.replace("p_min_bar = 0.08", "p_min_bar = 0.5"), "p_min_bar < p_max_bar"),
+        (PNEUMATIC.replace("channel = 5", "channel = 4"), "channel 4 is given to two chambers"),
+        (PNEUMATIC.replace("channel = 5", "channel = 12"), r"chambers\[...\].channel|chambers\[5\].channel"),
+        (PNEUMATIC.replace("tools = []", 'tools = ["a.rom"]'), "4: base, then modules 1 to 3"),
+        (PNEUMATIC.replace("[robot]", "[robot"), "not valid TOML"),
+        (PNEUMATIC + '\n[colour]\npaint = "red"\n', "colour"),
+        (robots.text_of("cable-4") + '\n[valve]\nmodel = "x"\nfull_scale_bar = 3.0\nsignal = "y"\n', "simulated"),
+        (robots.text_of("cable-4").replace('"cable"', '"pneumatic"'), "full_scale_bar"),
+    ],
+)  # fmt: skip
+def test_every_mistake_is_one_line_that_names_it(text, expected):
+    with pytest.raises(RobotFileError, match=expected) as caught:
+        robots.parse(text, "robot.toml")
+    assert str(caught.value).startswith("robot.toml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_wrong_name_lists_the_shipped_robots(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(RobotFileError, match="pneumatic-2, pneumatic-3"):
+        robots.load("octopus")
+
+
+def test_a_binary_file_is_refused(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(RobotFileError, match="UTF-8"):
+        robots.load(path)
+
+
+def test_msgspec_keeps_unknown_keys_out_of_every_section():
+    def sections(kind):
+        yield kind
+        for field in msgspec.structs.fields(kind):
+            for inner in getattr(field.type, "__args__", (field.type,)):
+                if isinstance(inner, type) and issubclass(inner, msgspec.Struct):
+                    yield from sections(inner)
+
+    assert {kind.__struct_config__.forbid_unknown_fields for kind in sections(robots.Robot)} == {True}

@@ -1,0 +1,71 @@
+"""The tasks of the supplement."""
+
+import numpy as np
+import pytest
+
+from modsoft.runtime import configuration, robot, trajectory
+from modsoft.runtime.errors import UsageError
+
+
+@pytest.mark.parametrize(("kind", "modules"), [("cable", 4), ("cable", 6), ("pneumatic", 2), ("pneumatic", 3)])
+def test_every_task_is_a_row_of_unit_vectors(kind, modules):
+    for name in trajectory.available(kind, modules):
+        desired = trajectory.task(name, kind, modules)
+        assert desired.shape == (250 if kind == "cable" else 200, modules, 3)
+        np.testing.assert_allclose(np.linalg.norm(desired, axis=-1), 1.0, atol=1e-12)
+
+
+def test_task_a_starts_straight_and_keeps_bending():
+    desired = trajectory.task("A", "cable", 4)
+    np.testing.assert_allclose(desired[0], [[0, 0, 1]] * 4, atol=1e-12)
+    np.testing.assert_allclose(desired[125, 3], [0.0, -np.sqrt(1 - 0.8125**2), 0.8125], atol=1e-12)
+
+
+def test_task_b_holds_v_z_and_the_tip_turns_against_the_others():
+    desired = trajectory.task("B", "cable", 4)
+    np.testing.assert_allclose(desired[:, :, 2], np.broadcast_to([0.998, 0.998, 0.996, 0.6], (250, 4)))
+    assert np.sign(desired[0, :, 1]).tolist() == [1, 1, 1, -1]
+
+
+def test_task_c_bends_in_y_then_turns():
+    desired = trajectory.task("C", "cable", 6)
+    np.testing.assert_allclose(desired[:51, :, 0], 0, atol=1e-12)
+    np.testing.assert_allclose(desired[50, :, 2], trajectory.BEND_V_Z[6])
+    np.testing.assert_allclose(desired[100, 5, 0], -0.8, atol=1e-12)  # a quarter turn, a = -1
+
+
+@pytest.mark.parametrize(("modules", "largest"), [(3, [3.6, 36.0, -39.6]), (2, [32.4, -32.4])])
+def test_down_is_the_triangle_of_s5(modules, largest):
+    angles = configuration.bending_angle_deg(trajectory.task("down", "pneumatic", modules))
+    for step, share in [(0, 0), (25, 0.5), (50, 1), (100, 0), (150, -1), (175, -0.5)]:
+        np.testing.assert_allclose(angles[step], share * np.array(largest), atol=1e-9)
+    np.testing.assert_allclose(angles.sum(axis=1), 0, atol=1e-9)
+
+
+def test_unknown_task_names_the_known_ones():
+    with pytest.raises(UsageError, match="edge, down"):
+        trajectory.load_task("sideways", robot.load("pneumatic-3"))
+
+
+def test_task_from_a_file(tmp_path):
+    path = tmp_path / "task.npy"
+    np.save(path, trajectory.task("edge", "pneumatic", 2))
+    loaded = trajectory.load_task(str(path), robot.load("pneumatic-2"))
+    assert np.array_equal(loaded, trajectory.task("edge", "pneumatic", 2))
+    with pytest.raises(UsageError, match=r"expected \(steps, 3, 3\)"):
+        trajectory.load_task(str(path), robot.load("pneumatic-3"))
+
+
+@pytest.mark.parametrize("content", [np.zeros((5, 2, 3)), np.ones((5, 2, 3), dtype=int), np.full((5, 2, 3), np.nan)])
+def test_task_file_of_no_unit_vectors_is_refused(tmp_path, content):
+    np.save(tmp_path / "task.npy", content)
+    with pytest.raises(UsageError, match="unit vector"):
+        trajectory.load_task(str(tmp_path / "task.npy"), robot.load("pneumatic-2"))
+
+
+def test_task_file_missing_or_damaged(tmp_path):
+    with pytest.raises(UsageError, match="no task file"):
+        trajectory.load_task(str(tmp_path / "none.npy"), robot.load("pneumatic-2"))
+    (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY broken")
+    with pytest.raises(UsageError, match="not a readable"):
+        trajectory.load_task(str(tmp_path / "bad.npy"), robot.load("pneumatic-2"))
