@@ -1,0 +1,37 @@
+# What a newcomer types: make demo, make install, make test. What a developer types: make check.
+
+# torch with two threads on two busy cores can be ten times slower than with one.
+export OMP_NUM_THREADS ?= 1
+export OMP_WAIT_POLICY ?= PASSIVE
+# The test matrices need no display.
+export MPLBACKEND ?= Agg
+
+PYTEST := .venv/bin/python -m pytest
+INSTALLED := .venv/.installed
+
+.PHONY: demo install test check firmware clean
+
+demo: $(INSTALLED)
+	.venv/bin/python tools/demo.py
+
+install:
+	tools/install.sh
+	@touch $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt tools/install.sh
+	tools/install.sh
+	@touch $@
+
+# Tests judged against the wall clock run alone, after all others.
+test: $(INSTALLED)
+	$(PYTEST) -n 2 --dist worksteal -m "not realtime"
+	$(PYTEST) -m realtime
+
+check: $(INSTALLED)
+	tools/check.sh
+
+firmware:
+	$(MAKE) -C firmware
+
+clean:
+	rm -rf build demo dist *.egg-info

@@ -1,0 +1,12 @@
+#!/bin/sh
+# Style and types, for people and for the tests. Type checkers do not follow the package mapping of pyproject.toml, so
+# they get links that look like it.
+set -eu
+cd "$(dirname "$0")/.."
+bin=.venv/bin
+mkdir -p build/types/modsoft
+for part in runtime training export; do ln -sfn "../../../$part" "build/types/modsoft/$part"; done
+ln -sfn ../../../tools/hil build/types/modsoft/hil
+"$bin/ruff" check .
+"$bin/python" tools/gen_protocol.py --check
+"$bin/mypy" -p modsoft.runtime -p modsoft.export -p modsoft.hil -p modsoft.training
