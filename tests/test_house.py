@@ -1,0 +1,47 @@
+"""What a reviewer would check by hand every time: style, the generated protocol, and who imports whom."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PARTS = {"runtime": 0, "training": 1, "export": 2, "hil": 3}
+FOLDERS = {"runtime": "runtime", "training": "training", "export": "export", "hil": "tools/hil"}
+HEAVY = {"torch", "onnx", "elastica", "h5py", "matplotlib", "numba", "tqdm"}
+
+
+def imports(path):
+    """Top names of absolute imports, and the parts of modsoft that a file uses."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inside = node.module == "modsoft"
+            yield from [f"modsoft.{alias.name}" for alias in node.names] if inside else [node.module]
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_imports_go_one_way(part):
+    for path in sorted((ROOT / FOLDERS[part]).glob("*.py")):
+        for name in imports(path):
+            if name.startswith("modsoft."):
+                other = name.split(".")[1]
+                assert PARTS[other] <= PARTS[part], f"{path.name} imports {name}"
+            if part == "runtime":
+                assert name.split(".")[0] not in HEAVY, f"{path.name} imports {name}"
+
+
+def test_style():
+    subprocess.run([sys.executable, "-m", "ruff", "check", "."], cwd=ROOT, check=True)
+
+
+def test_firmware_header_is_generated_from_the_protocol():
+    subprocess.run([sys.executable, "tools/gen_protocol.py", "--check"], cwd=ROOT, check=True)
+
+
+def test_init_files_stay_empty():
+    for folder in FOLDERS.values():
+        assert (ROOT / folder / "__init__.py").read_text() == ""
