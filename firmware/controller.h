@@ -1,0 +1,82 @@
+/* What the board does: states, timers, faults. Plain C without a clock, a port or a pin of its own, so that the very
+ * same source runs in the tests and in the emulated boards; firmware.ino feeds it and carries out what it decides.
+ *
+ *   BOOT -> IDLE -ARM-> ARMED -first SET-> RUNNING -VENT-> IDLE
+ *   any  -> FAULT (latched, vents) -CLEAR_FAULT of exactly those faults, pressures down-> IDLE
+ *
+ * Outputs follow set-points in RUNNING alone; in every other state their target is 0. */
+#ifndef CONTROLLER_H
+#define CONTROLLER_H
+
+#include <stdint.h>
+
+#include "frame.h"
+#include "output.h"
+#include "protocol.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* The checks of one pass; the hardware watchdog is fed only after all of them. */
+enum check { CHECK_LINK = 1, CHECK_CONTROL = 2, CHECK_SENSORS = 4, CHECK_OUTPUTS = 8, CHECK_ALL = 15 };
+
+struct controller {
+  uint8_t state;      /* enum state */
+  uint16_t faults;    /* enum fault, latched */
+  uint32_t boot_id;
+  uint8_t reset_cause;
+  uint32_t now_ms; /* of the last update */
+
+  uint8_t session;         /* the last one armed; 0 before the first */
+  uint16_t channels;       /* bit c: this session drives channel c */
+  uint8_t last_seq;        /* of the last SET accepted; in ARMED of the ARM */
+  uint32_t tick;           /* the host's control loop, as last told */
+  uint32_t set_tick;       /* of the last SET accepted */
+  int16_t set_points[PROTOCOL_CHANNELS];
+
+  uint8_t hears_heartbeats;
+  uint32_t heartbeats_since_ms; /* unbroken since */
+  uint32_t last_heartbeat_ms;
+  uint32_t last_valid_ms;    /* last frame that feeds the link timer */
+  uint32_t last_progress_ms; /* last frame with a later tick */
+
+  int16_t measured[PROTOCOL_CHANNELS];
+  uint16_t over_ms[PROTOCOL_CHANNELS];
+  int16_t disagree_ms[PROTOCOL_CHANNELS]; /* counts up while above, down while below what is applied */
+  uint16_t supply_mv;
+
+  struct output_stage output;
+  struct frame_parser parser;
+  uint16_t rx_good, rx_bad, rx_refused;
+
+  uint32_t last_status_ms;
+  uint8_t tx_seq;
+  uint8_t tx[256]; /* ring; its indices wrap by themselves */
+  uint8_t tx_head, tx_tail;
+};
+
+/* Starts vented, in BOOT, with the HELLO already queued. */
+void controller_init(struct controller *c, uint32_t boot_id, uint8_t reset_cause, uint32_t now_ms);
+
+/* One byte from the host. */
+void controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms);
+
+/* Once a loop: timers, faults, outputs, STATUS. measured is in 10 Pa, PROTOCOL_NOT_MEASURED where there is no sensor.
+ * Returns the checks done, CHECK_ALL when all is well; then, and only then, the watchdog may be fed. */
+uint8_t controller_update(struct controller *c, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,
+                          uint32_t now_ms);
+
+/* PWM counts of a channel, see output.h. */
+uint16_t controller_counts(const struct controller *c, uint8_t channel);
+
+/* Next byte for the host, or -1. What does not fit the queue is dropped as whole frames: the board never waits. */
+int16_t controller_next_byte(struct controller *c);
+
+/* Size of the struct, for callers that only hold memory for it. */
+uint16_t controller_size(void);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,49 @@
+/* Frames on the wire: 0x00 | COBS(type, seq, session, payload, crc32) | 0x00. Knows nothing of what they mean. */
+#ifndef FRAME_H
+#define FRAME_H
+
+#include <stdint.h>
+
+#include "protocol.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+struct frame {
+  uint8_t type;
+  uint8_t seq;
+  uint8_t session;
+  uint8_t length;         /* of the payload */
+  const uint8_t *payload; /* valid until the next byte is received */
+};
+
+enum frame_event { FRAME_NONE, FRAME_GOOD, FRAME_BAD };
+
+/* Decodes byte by byte; zeroed memory is a valid start. */
+struct frame_parser {
+  uint8_t decoded[PROTOCOL_MAX_DECODED];
+  uint8_t length;
+  uint8_t remaining;    /* bytes of the current COBS run still to come */
+  uint8_t zero_pending; /* the last run ends in a zero, unless the frame ends first */
+  uint8_t started;      /* something came since the last delimiter */
+  uint8_t broken;       /* too long: dropped up to the next delimiter */
+};
+
+/* Takes one byte. FRAME_GOOD: *frame is set. FRAME_BAD: something ended that was no frame. */
+enum frame_event frame_receive(struct frame_parser *parser, uint8_t byte, struct frame *frame);
+
+/* Largest result of frame_encode: both delimiters and the COBS code byte. */
+#define FRAME_MAX_ENCODED (PROTOCOL_MAX_ENCODED + 2)
+
+/* Writes a whole frame with its delimiters, returns its length. The payload must fit PROTOCOL_MAX_DECODED. */
+uint8_t frame_encode(uint8_t *encoded, uint8_t type, uint8_t seq, uint8_t session, const void *payload,
+                     uint8_t length);
+
+/* CRC-32 as zlib computes it. */
+uint32_t frame_crc32(const uint8_t *data, uint8_t length);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,33 @@
+/* The output stage: clamp, slew limit, pressure to PWM counts. Nothing else decides what a valve gets. */
+#ifndef OUTPUT_H
+#define OUTPUT_H
+
+#include <stdint.h>
+
+#include "protocol.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+struct output_stage {
+  int16_t applied[PROTOCOL_CHANNELS]; /* 10 Pa, what the valves are told now */
+  uint16_t remainder;                 /* part of a slew step not yet spent, 10 Pa / 1000 */
+};
+
+/* Moves every channel towards its target, clamped to 0 .. P_MAX, by no more than the slew limit allows in elapsed_ms. */
+void output_step(struct output_stage *stage, const int16_t targets[PROTOCOL_CHANNELS], uint16_t elapsed_ms);
+
+/* All channels to 0 at once. */
+void output_dump(struct output_stage *stage);
+
+/* 1 where every channel is at 0. */
+uint8_t output_is_vented(const struct output_stage *stage);
+
+/* PWM counts, 0 to PWM_COUNTS, of a channel; 0 stands for "disconnected". */
+uint16_t output_counts(const struct output_stage *stage, uint8_t channel);
+
+#ifdef __cplusplus
+}
+#endif
+#endif
