@@ -1,0 +1,137 @@
+"""The real-time plant: duties to set-points, poses as the tracker sees them, deadlines on virtual time."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from modsoft.hil.plant import Plant, duties_from, run, set_points_bar, tool_poses
+from modsoft.runtime import robot as robots
+from modsoft.runtime.actuation import channel_pressures_bar, pressures_bar
+from modsoft.runtime.configuration import from_directors, from_poses
+
+
+class StandIn:
+    """An arm whose chambers are at their set-points at once and whose modules bend by the difference, 1 rad a bar."""
+
+    def __init__(self, modules):
+        self.pressures = np.zeros((modules, 2))
+        self.time_s = 0.0
+
+    def set_pressures(self, bar):
+        self.pressures = np.array(bar)
+
+    def advance(self, duration_s):
+        self.time_s += duration_s
+
+    @property
+    def directors(self):
+        angle = np.cumsum(self.pressures[:, 0] - self.pressures[:, 1])
+        zero, one = np.zeros_like(angle), np.ones_like(angle)
+        rows = [
+            np.stack([np.cos(angle), zero, -np.sin(angle)], -1),
+            np.stack([zero, one, zero], -1),
+            np.stack([np.sin(angle), zero, np.cos(angle)], -1),
+        ]
+        return np.stack(rows, axis=1)
+
+    @property
+    def configuration(self):
+        return from_directors(self.directors)
+
+    @property
+    def positions(self):
+        return np.cumsum(self.directors[:, 2] * 0.05, axis=0)
+
+
+@pytest.fixture
+def robot():
+    return robots.load("pneumatic-3")
+
+
+def test_the_set_points_undo_what_the_runtime_sends(robot):
+    actuation = np.array([[0.3], [-1.0], [0.0]])
+    duty = channel_pressures_bar(robot, actuation) / robot.valve.full_scale_bar
+    np.testing.assert_allclose(set_points_bar(robot, duty), pressures_bar(robot, actuation), atol=1e-12)
+
+
+def test_no_duty_is_no_pressure(robot):
+    assert not set_points_bar(robot, np.zeros(0)).any()
+
+
+def test_the_tracker_sees_the_configuration(robot):
+    arm = StandIn(3)
+    arm.set_pressures([[0.3, 0.08], [0.08, 0.35], [0.2, 0.1]])
+    poses = tool_poses(arm.positions, arm.directors)
+    np.testing.assert_allclose(from_poses(poses), arm.configuration, atol=1e-12)
+    assert not np.allclose(poses[0, :3, :3], np.eye(3)), "the base must not stand straight in the tracker's frame"
+    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
+    # neighbouring tools are as far apart as the module ends, in mm
+    np.testing.assert_allclose(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), 50.0)
+
+
+class Time:
+    """Virtual time: sleeping moves it on, and so does work that is told to take long."""
+
+    def __init__(self):
+        self.now_ns = 1_000_000
+
+    def clock_ns(self):
+        return self.now_ns
+
+    def sleep(self, seconds):
+        self.now_ns += round(seconds * 1e9)
+
+
+def test_slices_keep_to_absolute_deadlines_and_catch_up(robot):
+    time, lines, arm = Time(), [], StandIn(3)
+    start = time.now_ns
+
+    def duties():
+        for k in range(10):
+            time.now_ns += 70_000_000 if k == 3 else 5_000_000  # slice 3 takes 70 ms, the others 5
+            yield None
+
+    run(Plant(robot, arm), duties(), lines.append, time.clock_ns, time.sleep, slice_s=0.02)
+    states = [line for line in lines if line["event"] == "state"]
+    assert lines[0] == {"event": "ready"}
+    assert [s["mono_ns"] - start for s in states] == [20_000_000 * (k + 1) for k in range(10)]
+    assert arm.time_s == pytest.approx(0.2)
+    assert time.now_ns - start == 200_000_000, "it must be in step again at the end"
+    assert states[3]["late_ms"] == pytest.approx(50)
+    assert states[4]["late_ms"] == pytest.approx(35)
+    assert states[-1]["late_ms"] == 0
+    assert lines[-1] == {"event": "summary", "slices": 10, "late_slices": 2, "late_max_ms": pytest.approx(50)}
+
+
+def test_duties_are_held_until_new_ones_come(robot):
+    lines, arm, time = [], StandIn(3), Time()
+    full = np.full(12, 0.1)
+    run(Plant(robot, arm), iter([None, full, None]), lines.append, time.clock_ns, time.sleep)
+    pressures = [np.max(line["pressure_bar"]) for line in lines if line["event"] == "state"]
+    assert pressures == pytest.approx([0.0, 0.3, 0.3])
+    assert lines[2]["channel_bar"] == pytest.approx({chamber.channel: 0.3 for chamber in robot.chambers})
+
+
+def test_the_newest_duties_of_the_pipe_win_and_its_end_ends():
+    read, write = os.pipe()
+    try:
+        duties = duties_from(read)
+        assert next(duties) is None
+        os.write(write, b'{"duty": [0.1]}\n{"duty": [0.2]}\n{"duty": [0')
+        np.testing.assert_array_equal(next(duties), [0.2])
+        os.write(write, b".3]}\n")
+        np.testing.assert_array_equal(next(duties), [0.3])
+        os.close(write)
+        with pytest.raises(StopIteration):
+            next(duties)
+    finally:
+        os.close(read)
+
+
+def test_every_line_is_json(robot):
+    lines = []
+    stepped = Plant(robot, StandIn(3))
+    run(stepped, iter([np.full(12, 0.1)]), lambda line: lines.append(json.dumps(line)), sleep=lambda seconds: None)
+    assert [json.loads(line)["event"] for line in lines] == ["ready", "state", "summary"]

@@ -1,0 +1,182 @@
+"""The simulated robot, in real time and in a process of its own: valve duties in, tool poses and pressures out.
+
+`python -m modsoft.hil.plant --robot FILE`. Standard input: one JSON line per change, `{"duty": [...]}`, the duty of
+each valve channel in [0, 1]; its end ends the process. Standard output, one JSON line each:
+
+    {"event": "ready"}                           the robot hangs at rest, time starts
+    {"event": "state", "mono_ns", "t_s", ...}    every slice: what `Plant.state` says; mono_ns is the CLOCK_MONOTONIC
+                                                 instant that the slice stands for
+    {"event": "summary", ...}                    slices, lateness
+
+The valves are ideal: a duty is that share of the full-scale pressure. Lag and chamber belong to `modsoft.training.arm`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.command import entry
+from modsoft.runtime.errors import RobotFileError
+from modsoft.runtime.robot import Robot
+
+Array = NDArray[np.float64]
+
+SLICE_S = 0.02
+# Where the tracker stands: the base's tool in its frame, 1.4 m in front and turned, so that a mistake in frames shows.
+_TURN_Z, _TURN_X = np.radians(35.0), np.radians(-100.0)
+BASE_IN_TRACKER = np.eye(4)
+BASE_IN_TRACKER[:3, :3] = np.array(
+    [[1, 0, 0], [0, np.cos(_TURN_X), -np.sin(_TURN_X)], [0, np.sin(_TURN_X), np.cos(_TURN_X)]]
+) @ np.array([[np.cos(_TURN_Z), -np.sin(_TURN_Z), 0], [np.sin(_TURN_Z), np.cos(_TURN_Z), 0], [0, 0, 1]])
+BASE_IN_TRACKER[:3, 3] = [60.0, -110.0, -1400.0]  # mm
+
+
+class PneumaticArm(Protocol):
+    """What the plant asks of `modsoft.training.arm.Arm`."""
+
+    configuration: Array  # (N, 3)
+    positions: Array  # (N, 3), m
+    directors: Array  # (N, 3, 3), rows d1, d2, d3
+    pressures: Array  # (N, 2), bar, in the chambers
+
+    def set_pressures(self, bar: Array) -> None: ...
+    def advance(self, duration_s: float) -> None: ...
+
+
+def set_points_bar(robot: Robot, duty: Array) -> Array:
+    """Set-points of the chambers (N, 2), sides + and -, bar, from the duty of each valve channel (channels,)."""
+    set_points = np.zeros((robot.modules, 2))
+    for chamber in robot.chambers:
+        share = duty[chamber.channel] if chamber.channel < len(duty) else 0.0
+        set_points[chamber.module - 1, "+-".index(chamber.side)] = share * robot.valve.full_scale_bar
+    return set_points
+
+
+def tool_poses(positions: Array, directors: Array) -> Array:
+    """Poses (N + 1, 4, 4) of the tools in the tracker's frame, base first: axes as columns, positions in mm.
+
+    positions (N, 3), m, and directors (N, 3, 3), rows d1, d2, d3: module ends in the lab frame, which is the base's.
+    """
+    in_base = np.tile(np.eye(4), (len(positions) + 1, 1, 1))
+    in_base[1:, :3, :3] = np.swapaxes(directors, -1, -2)
+    in_base[1:, :3, 3] = 1000.0 * np.asarray(positions)
+    return BASE_IN_TRACKER @ in_base
+
+
+class Plant:
+    """The arm behind its valves: duties in, poses and chamber pressures out."""
+
+    def __init__(self, robot: Robot, arm: PneumaticArm):
+        self.robot = robot
+        self.arm = arm
+        self.time_s = 0.0
+
+    def advance(self, duty: Array, duration_s: float) -> None:
+        """Advances the arm with the duties (channels,) held."""
+        self.arm.set_pressures(set_points_bar(self.robot, duty))
+        self.arm.advance(duration_s)
+        self.time_s += duration_s
+
+    def channel_bar(self) -> dict[int, float]:
+        """Chamber pressure at each valve channel in use, bar."""
+        pressures = self.arm.pressures
+        return {c.channel: float(pressures[c.module - 1, "+-".index(c.side)]) for c in self.robot.chambers}
+
+    def state(self) -> dict[str, Any]:
+        """Plain values: time_s simulated, configuration (N, 3), pressure_bar (N, 2), channel_bar {channel: bar},
+        poses (N + 1, 4, 4) for the tracker."""
+        return {
+            "t_s": round(self.time_s, 6),
+            "configuration": np.asarray(self.arm.configuration).tolist(),
+            "pressure_bar": np.asarray(self.arm.pressures).tolist(),
+            "channel_bar": self.channel_bar(),
+            "poses": tool_poses(np.asarray(self.arm.positions), np.asarray(self.arm.directors)).tolist(),
+        }
+
+
+def run(
+    plant: Plant,
+    duties: Iterator[Array | None],
+    write: Callable[[dict[str, Any]], None],
+    clock_ns: Callable[[], int] = time.monotonic_ns,
+    sleep: Callable[[float], None] = time.sleep,
+    slice_s: float = SLICE_S,
+) -> None:
+    """Slices at absolute deadlines until `duties` ends. `duties` gives the newest duties, or None where none came.
+
+    A late slice is not skipped: simulated time has to be real time again, so the next ones follow without a pause.
+    """
+    duty = np.zeros(0)
+    slices = late = 0
+    worst_ns = 0
+    slice_ns = round(slice_s * 1e9)
+    write({"event": "ready"})
+    start_ns = clock_ns()
+    for newest in duties:
+        if newest is not None:
+            duty = newest
+        plant.advance(duty, slice_s)
+        slices += 1
+        deadline_ns = start_ns + slices * slice_ns
+        left_ns = deadline_ns - clock_ns()
+        if left_ns > 0:
+            sleep(left_ns * 1e-9)
+        lateness_ns = max(0, clock_ns() - deadline_ns)
+        worst_ns = max(worst_ns, lateness_ns)
+        late += lateness_ns > slice_ns
+        write({"event": "state", "mono_ns": deadline_ns, "late_ms": lateness_ns * 1e-6, **plant.state()})
+    write({"event": "summary", "slices": slices, "late_slices": int(late), "late_max_ms": worst_ns * 1e-6})
+
+
+def duties_from(descriptor: int) -> Iterator[Array | None]:
+    """The newest duties that stand in the pipe, None while there are none, ends at its end."""
+    pending = b""
+    while True:
+        newest = None
+        while select.select([descriptor], [], [], 0.0)[0]:
+            chunk = os.read(descriptor, 65536)
+            if not chunk:
+                return
+            *lines, pending = (pending + chunk).split(b"\n")
+            if lines:
+                newest = np.asarray(json.loads(lines[-1])["duty"], dtype=np.float64)
+        yield newest
+
+
+@click.command("modsoft-hil-plant")
+@click.option("--robot", "robot_file", required=True, type=Path, help="Robot file, or the name of a shipped robot.")
+def cli(robot_file: Path) -> None:
+    """The simulated pneumatic robot in real time (started by modsoft-hil)."""
+    from modsoft.training.arm import Arm  # the simulator takes a second to import
+
+    robot = robots.load(robot_file)
+    if robot.robot.kind != "pneumatic":
+        raise RobotFileError(f"{robot_file}: a {robot.robot.kind} robot has no valves; the rig runs pneumatic robots")
+
+    def write(line: dict[str, Any]) -> None:
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+
+    arm = Arm(robot.robot.kind, robot.modules)
+    warm = Plant(robot, arm)
+    warm.advance(np.zeros(0), SLICE_S)  # compiles
+    arm.reset()
+    run(Plant(robot, arm), duties_from(sys.stdin.fileno()), write)
+
+
+main = entry(cli)
+
+if __name__ == "__main__":
+    main()
