@@ -1,0 +1,20 @@
+/* What is known about the last reset. */
+#ifndef BOOT_H
+#define BOOT_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* A number that differs from the one before the last reset, so that the host notices one. Call once. */
+uint32_t boot_next_id(void);
+
+/* enum reset_cause; call after boot_next_id. */
+uint8_t boot_reset_cause(void);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

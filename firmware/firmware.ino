@@ -1,0 +1,52 @@
+// The board between the lab PC and the valves. Thin on purpose: what it decides stands in controller.c and output.c,
+// which are tested on a PC; here they meet the serial port, the pins and the clock.
+//
+// Before flashing, check limits.h (your valves' full scale) and pins.h (your wiring).
+
+#include <avr/sleep.h>
+#include <avr/wdt.h>
+
+#include "boot.h"
+#include "controller.h"
+#include "pins.h"
+#include "pwm.h"
+#include "sensors.h"
+
+static struct controller board;
+static struct sensors inputs;
+
+void setup() {
+  pwm_begin();
+  sensors_begin(&inputs);
+  Serial.begin(BAUD);
+  const uint32_t id = boot_next_id();
+  controller_init(&board, id, boot_reset_cause(), millis());
+  set_sleep_mode(SLEEP_MODE_IDLE);
+  wdt_enable(WDTO_120MS);
+}
+
+void loop() {
+  const uint32_t now_ms = millis();
+
+  // At most one receive buffer a pass, so that a flood cannot keep the checks from running.
+  for (uint8_t i = 0; i < SERIAL_RX_BUFFER_SIZE && Serial.available() > 0; i++) {
+    controller_receive(&board, (uint8_t)Serial.read(), now_ms);
+  }
+  sensors_poll(&inputs);
+  const uint8_t checks = controller_update(&board, inputs.measured, inputs.supply_mv, now_ms);
+  for (uint8_t channel = 0; channel < CHANNELS_USED; channel++) {
+    pwm_write(channel, controller_counts(&board, channel));
+  }
+  // Never waits for the host to read.
+  while (Serial.availableForWrite() > 0) {
+    const int16_t next = controller_next_byte(&board);
+    if (next < 0) {
+      break;
+    }
+    Serial.write((uint8_t)next);
+  }
+  if (checks == CHECK_ALL) {
+    wdt_reset();
+  }
+  sleep_mode();  // until the next interrupt, a millisecond at most
+}
