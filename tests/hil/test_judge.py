@@ -1,0 +1,250 @@
+"""The verdict: a made-up flawless run passes, and every flaw planted in it breaks its own line and no other."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from modsoft.hil import judge as judging
+from modsoft.hil.judge import Record, Valves, judge
+from modsoft.runtime import robot as robots
+from modsoft.runtime.actuation import channel_pressures_bar
+from modsoft.runtime.configuration import from_angles_deg
+
+TICKS = 120
+PERIOD_NS = 400_000_000
+START_NS = 5_000_000_000
+COUNTS = 4096
+ROBOT = robots.load("pneumatic-3")
+
+
+def slewed(commanded):
+    """Timer registers of a board that follows: 5 ms after the tick, one change every 10 ms at the slew limit."""
+    times, rows = [], []
+    applied = np.zeros(commanded.shape[1])
+    for k, target in enumerate(commanded):
+        now = START_NS + k * PERIOD_NS + 5_000_000
+        while not np.array_equal(applied, target):
+            applied = applied + np.clip(target - applied, -0.02, 0.02)
+            applied = np.where(np.abs(applied - target) < 1e-12, target, applied)
+            times.append(now)
+            rows.append(np.round(applied / ROBOT.valve.full_scale_bar * COUNTS) / COUNTS)
+            now += 10_000_000
+    end = START_NS + len(commanded) * PERIOD_NS
+    times.append(end + 1_000_000)
+    rows.append(np.zeros(commanded.shape[1]))
+    return Valves(np.array(times), np.array(rows), COUNTS), end
+
+
+@pytest.fixture
+def flawless():
+    k = np.arange(TICKS)
+    actuation = np.sin(k / 9.0)[:, None, None] * np.array([[0.2], [0.6], [-1.0]])
+    commanded = np.array([channel_pressures_bar(ROBOT, a) for a in actuation])
+    angles = np.sin(k / 9.0)[:, None] * np.array([3.0, 30.0, -35.0])
+    valves, end = slewed(commanded)
+    mono = START_NS + k * PERIOD_NS
+    plant_mono = np.arange(START_NS - PERIOD_NS, end + 2 * PERIOD_NS, 20_000_000)
+    plant_angles = np.stack([np.interp(plant_mono, mono, angles[:, i]) for i in range(3)], axis=-1)
+    bar = np.zeros((len(plant_mono), 3, 2))
+    return Record(
+        robot=ROBOT,
+        task="down",
+        steps=TICKS,
+        runtime_exit=0,
+        runtime_said="",
+        tick=k,
+        mono_ns=mono,
+        lateness_ms=np.full(TICKS, 0.3),
+        missed=0,
+        held=0,
+        desired=from_angles_deg(angles),
+        configuration=from_angles_deg(angles),
+        frame_mono_ns=mono - 8_000_000,
+        commanded_bar=commanded,
+        acknowledged_ms=np.full(TICKS, 7.5),
+        faults=np.zeros(TICKS, dtype=np.int64),
+        state=["RUNNING"] * TICKS,
+        end_ns=end,
+        valves=valves,
+        board_events=[{"event": "reset", "cause": "external", "mono_ns": START_NS - 3_000_000_000}],
+        board_summary={"rx_dropped": 0, "late_max_ms": 1.2},
+        plant_mono_ns=plant_mono,
+        plant_configuration=from_angles_deg(plant_angles),
+        plant_bar=bar,
+        plant_late_ms=np.full(len(plant_mono), 0.5),
+    )
+
+
+def broken(verdict):
+    return [line.name for line in verdict.acceptances if not line.ok]
+
+
+def test_a_flawless_run_passes(flawless):
+    verdict = judge(flawless)
+    assert broken(verdict) == []
+    assert str(verdict) == "passed"
+    assert verdict.exit_code == 0
+
+
+def changed(array, index, value):
+    array = array.copy()
+    array[index] = value
+    return array
+
+
+def other_duty(record, shift, rows=slice(60, 61), channel=0):
+    """The registers of one channel off by `shift` counts for some rows."""
+    duty = record.valves.duty.copy()
+    duty[rows, channel] += shift / COUNTS
+    return record.valves._replace(duty=duty)
+
+
+def unsettled(record):
+    """A change of one channel by three counts in the middle of a settled tick, taken back 10 ms later."""
+    at = record.mono_ns[50] + 300_000_000
+    row = int(np.searchsorted(record.valves.mono_ns, at))
+    glitch = record.valves.duty[row - 1].copy()
+    glitch[3] += 3 / COUNTS
+    return Valves(
+        np.insert(record.valves.mono_ns, row, [at, at + 10_000_000]),
+        np.insert(record.valves.duty, row, [glitch, record.valves.duty[row - 1]], axis=0),
+        COUNTS,
+    )
+
+
+def late_valves(record):
+    """Every change 250 ms later than commanded."""
+    return record.valves._replace(mono_ns=record.valves.mono_ns + 250_000_000)
+
+
+OFF_THE_LOG = "valve outputs off the log, worst of every tick and channel"
+
+FLAWS = {
+    "exit code of modsoft-runtime": lambda r: {"runtime_exit": 79},
+    "ticks": lambda r: {"steps": TICKS + 1},
+    "missed ticks": lambda r: {"missed": 1},
+    "ticks held for want of a good tracker frame": lambda r: {"held": 1},
+    "lateness of a tick, 99th percentile": lambda r: {"lateness_ms": changed(r.lateness_ms, slice(0, 2), 20.0)},
+    "set-points never acknowledged": lambda r: {"acknowledged_ms": changed(r.acknowledged_ms, 7, math.nan)},
+    "set-point to acknowledgement, 99th percentile": lambda r: {
+        "acknowledged_ms": changed(r.acknowledged_ms, slice(0, 2), 51.0)
+    },
+    "faults of the board": lambda r: {"faults": changed(r.faults, 40, 4)},
+    "ticks that the board did not follow": lambda r: {"state": [*r.state[:-1], "FAULT"]},
+    "resets in the run": lambda r: {
+        "board_events": [*r.board_events, {"event": "reset", "cause": "external", "mono_ns": r.mono_ns[9]}]
+    },
+    "watchdog resets": lambda r: {"board_events": [{"event": "watchdog", "mono_ns": r.mono_ns[0] - 1}]},
+    "bytes dropped by the board's receiver": lambda r: {"board_summary": {**r.board_summary, "rx_dropped": 1}},
+    "largest duty at the end": lambda r: {"valves": other_duty(r, 1, rows=slice(-1, None))},
+    "highest chamber pressure at the end": lambda r: {"plant_bar": changed(r.plant_bar, (-1, 2, 1), 0.05)},
+    "ticks without time for the valves to settle": lambda r: {"end_ns": int(r.mono_ns[-1]) + 30_000_000},
+    "configuration used, off the plant's own": lambda r: {
+        "plant_configuration": from_angles_deg(np.full((len(r.plant_mono_ns), 3), 60.0))
+    },
+}
+
+
+@pytest.mark.parametrize("name", FLAWS)
+def test_each_flaw_breaks_its_own_line(flawless, name):
+    verdict = judge(replace(flawless, **FLAWS[name](flawless)))
+    assert broken(verdict) == [name]
+    assert verdict.word == "failed"
+    assert name in verdict.reason
+    assert verdict.exit_code == 1
+
+
+def test_no_line_goes_without_a_flaw(flawless):
+    assert {line.name for line in judge(flawless).acceptances} == {*FLAWS, OFF_THE_LOG}
+
+
+@pytest.mark.parametrize("valves", [unsettled, late_valves, lambda r: other_duty(r, 2, rows=slice(0, -1))])
+def test_valves_that_do_not_follow_the_log_fail(flawless, valves):
+    assert OFF_THE_LOG in broken(judge(replace(flawless, valves=valves(flawless))))
+
+
+def test_a_valve_that_answers_another_channel_fails(flawless):
+    duty = flawless.valves.duty[:, [1, 0, *range(2, 12)]]
+    assert broken(judge(replace(flawless, valves=flawless.valves._replace(duty=duty)))) == [OFF_THE_LOG]
+
+
+def test_every_tick_is_compared(flawless):
+    assert np.isfinite(judging.valve_difference(flawless)).all()
+    assert np.nanmax(judging.valve_difference(flawless)) <= 0.5
+
+
+def test_one_count_is_rounding(flawless):
+    """Half a count of rounding stands in the registers already; another half is the firmware's right."""
+    duty = flawless.valves.duty.copy()
+    duty[:-1] += 0.4 / COUNTS
+    assert judge(replace(flawless, valves=flawless.valves._replace(duty=duty))).word == "passed"
+
+
+def test_a_slow_host_voids_the_timing_and_nothing_else(flawless):
+    slow = {"board_summary": {"rx_dropped": 0, "late_max_ms": 180.0}}
+    verdict = judge(replace(flawless, **slow, lateness_ms=np.full(TICKS, 60.0), missed=3))
+    assert verdict.word == "not judged"
+    assert verdict.exit_code == 3
+    assert "the host was too slow" in verdict.reason
+    assert "180 ms" in verdict.reason
+    worse = judge(replace(flawless, **slow, faults=changed(flawless.faults, 3, 1)))
+    assert worse.word == "failed"
+
+
+def test_a_slow_plant_is_a_slow_host(flawless):
+    late = changed(flawless.plant_late_ms, 70, 200.0)
+    assert judge(replace(flawless, plant_late_ms=late)).word == "not judged"
+
+
+def test_a_short_run_is_not_judged(flawless):
+    short = {
+        name: getattr(flawless, name)[:50]
+        for name in "tick mono_ns lateness_ms desired configuration frame_mono_ns commanded_bar acknowledged_ms".split()
+    }
+    record = replace(flawless, **short, steps=50, faults=flawless.faults[:50], state=flawless.state[:50])
+    verdict = judge(replace(record, end_ns=flawless.mono_ns[50]))
+    assert broken(verdict) == []
+    assert verdict.word == "not judged"
+    assert "at least 100" in verdict.reason
+
+
+def test_a_run_without_a_tick_fails_in_words(flawless):
+    empty = {
+        name: getattr(flawless, name)[:0]
+        for name in "tick mono_ns lateness_ms desired configuration frame_mono_ns commanded_bar acknowledged_ms".split()
+    }
+    verdict = judge(replace(flawless, **empty, runtime_exit=65, faults=flawless.faults[:0], state=[]))
+    assert verdict.word == "failed"
+    assert "exit code of modsoft-runtime" in broken(verdict)
+    assert "ticks" in broken(verdict)
+
+
+def test_tracking_has_limits_by_task_and_modules(flawless, monkeypatch):
+    monkeypatch.setitem(judging.TRACKING_DEG, ("down", 3), [1.0, 2.0, 3.0])
+    assert judge(flawless).word == "passed"
+    off = flawless.configuration.copy()
+    off[:, 1] = from_angles_deg(judging.bending_angle_deg(flawless.desired[:, 1]) + 2.1)
+    plant = np.repeat(off, 20, axis=0)
+    verdict = judge(
+        replace(
+            flawless,
+            configuration=off,
+            plant_configuration=plant,
+            plant_mono_ns=START_NS + np.arange(len(plant)) * 20_000_000,
+            frame_mono_ns=flawless.mono_ns,
+            plant_bar=np.zeros((len(plant), 3, 2)),
+        )
+    )
+    assert broken(verdict) == ["tracking error of module 2, mean"]
+
+
+def test_percentiles_are_values_that_were_measured():
+    assert judging.percentile(np.array([1.0, 2.0, 50.0]), 99) == 50.0
+    assert math.isnan(judging.percentile(np.array([]), 99))
+
+
+def test_small_angles_are_exact():
+    one = from_angles_deg(np.array([0.001]))
+    assert judging.angle_between_deg(one, from_angles_deg(np.array([0.0])))[0] == pytest.approx(0.001, rel=1e-9)

@@ -1,0 +1,248 @@
+"""The verdict on a run of the rig: one line for each acceptance, from the run log, the timer registers and the plant.
+
+The sources are independent of each other: what the runtime says it did (`run.jsonl`), what the emulated board's timer
+registers held (`valves.jsonl`), and where the simulated robot really was (`plant.jsonl`). Nothing here reads a clock
+or a file; `modsoft.hil.record` does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.robot import Robot
+
+Array = NDArray[np.float64]
+
+# ---- What a run has to show -------------------------------------------------------------------------------------
+
+FEWEST_TICKS = 100  # below it a 99th percentile says nothing
+MISSED_TICKS = 0
+HELD_TICKS = 0
+LATENESS_P99_MS = 20.0
+ACKNOWLEDGED_P99_MS = 50.0
+VALVE_COUNTS = 1.0  # of the timer: a set-point is rounded to counts once
+DROPPED_BYTES = 0
+CHAMBERS_AT_END_BAR = 0.02
+MEASURED_OFF_DEG = 1.5  # the tracker rounds, and its frame is up to 40 ms old while the robot moves
+# Mean tracking error of each module, degrees, by task and number of modules.
+TRACKING_DEG: dict[tuple[str, int], list[float]] = {}
+# The witnesses that the host kept up. Beyond these the timing says more about the host than about the software.
+BOARD_LATE_MS = 20.0
+PLANT_LATE_MS = 60.0
+SETTLING_S = 0.03  # after acknowledgement and slew: one loop of the firmware, and the board's permitted lateness
+
+
+class Valves(NamedTuple):
+    """Duties of all channels from the timer registers. Row j holds from mono_ns[j] until mono_ns[j + 1]."""
+
+    mono_ns: NDArray[np.int64]  # (E,)
+    duty: Array  # (E, channels)
+    counts: int  # of a full duty
+
+    def between(self, start_ns: int, end_ns: int) -> Array:
+        """Every duty (n, channels) that stood at some time in [start, end]; zeros before the first row."""
+        first = int(np.searchsorted(self.mono_ns, start_ns, side="right")) - 1
+        last = int(np.searchsorted(self.mono_ns, end_ns, side="right"))
+        rows = self.duty[max(first, 0) : last]
+        return np.vstack([np.zeros((1, self.duty.shape[1])), rows]) if first < 0 else rows
+
+
+@dataclass(frozen=True)
+class Record:
+    """A run, as the three sources tell it. K ticks, N modules, M slices of the plant; times are CLOCK_MONOTONIC."""
+
+    robot: Robot
+    task: str
+    steps: int  # that the run should have
+    runtime_exit: int
+    runtime_said: str  # its last line, for a run that failed
+    tick: NDArray[np.int64]  # (K,)
+    mono_ns: NDArray[np.int64]  # (K,) start of the tick
+    lateness_ms: Array  # (K,)
+    missed: int
+    held: int
+    desired: Array  # (K, N, 3)
+    configuration: Array  # (K, N, 3), NaN where no frame was good
+    frame_mono_ns: NDArray[np.int64]  # (K,) when the frame used came in
+    commanded_bar: Array  # (K, channels)
+    acknowledged_ms: Array  # (K,), NaN where none came
+    faults: NDArray[np.int64]  # (K,)
+    state: list[str]  # (K,) the board's
+    end_ns: int  # the vent begins: outputs no longer follow the last tick
+    valves: Valves
+    board_events: list[dict[str, Any]]  # resets and watchdog, all of the emulator's life
+    board_summary: dict[str, Any]
+    plant_mono_ns: NDArray[np.int64]  # (M,)
+    plant_configuration: Array  # (M, N, 3)
+    plant_bar: Array  # (M, N, 2)
+    plant_late_ms: Array  # (M,)
+
+
+class Acceptance(NamedTuple):
+    """One line of the verdict. `timing` lines are void on a host that did not keep up."""
+
+    name: str
+    found: str
+    limit: str
+    ok: bool
+    timing: bool = False
+
+
+class Verdict(NamedTuple):
+    """`word`: passed, failed, or not judged; `reason` says why where it is not passed."""
+
+    word: str
+    reason: str
+    acceptances: list[Acceptance]
+    witnesses: list[Acceptance]
+
+    @property
+    def exit_code(self) -> int:
+        return {"passed": 0, "failed": 1, "not judged": 3}[self.word]
+
+    def __str__(self) -> str:
+        return f"{self.word}: {self.reason}" if self.reason else self.word
+
+
+# ---- Figures ------------------------------------------------------------------------------------------------------
+
+
+def percentile(values: Array, share: float) -> float:
+    """The measured value that `share` percent do not exceed; never interpolated between two. NaN of nothing."""
+    values = np.asarray(values, dtype=np.float64)
+    return float(np.percentile(values, share, method="higher")) if len(values) else math.nan
+
+
+def angle_between_deg(one: Array, other: Array) -> Array:
+    """Angle between unit vectors (..., 3), degrees, exact for small angles too."""
+    across = np.linalg.norm(np.cross(one, other), axis=-1)
+    return np.degrees(np.arctan2(across, np.sum(np.asarray(one) * other, axis=-1)))
+
+
+def tracking_error_deg(record: Record) -> Array:
+    """|bending angle measured at the start of tick k - desired angle of tick k|, (K, N): the paper's convention, which
+    charges the controller with the one period that every action needs to act."""
+    off = bending_angle_deg(record.configuration) - bending_angle_deg(record.desired)
+    return np.abs((off + 180.0) % 360.0 - 180.0)
+
+
+def valve_difference(record: Record) -> Array:
+    """Largest difference (K,) of timer registers from what the log says was commanded, in counts, over all channels
+    and all the time from when the slew must have settled until the next tick starts. NaN: no such time."""
+    scale = record.valves.counts / record.robot.valve.full_scale_bar
+    worst = np.full(len(record.tick), np.nan)
+    before = np.zeros(record.commanded_bar.shape[1])
+    for k, commanded in enumerate(record.commanded_bar):
+        slew_s = np.max(np.abs(commanded - before)) / record.robot.limits.slew_bar_per_s
+        acknowledged_s = np.nan_to_num(record.acknowledged_ms[k], nan=ACKNOWLEDGED_P99_MS) * 1e-3
+        settled_ns = record.mono_ns[k] + round((acknowledged_s + slew_s + SETTLING_S) * 1e9)
+        until_ns = record.mono_ns[k + 1] if k + 1 < len(record.tick) else record.end_ns
+        if settled_ns <= until_ns:
+            stood = record.valves.between(settled_ns, until_ns)
+            worst[k] = np.max(np.abs(stood * record.valves.counts - commanded * scale))
+        before = commanded
+    return worst
+
+
+def measured_off_deg(record: Record) -> Array:
+    """Angle (K, N) between the configuration that the runtime used and the plant's own when that frame came in."""
+    plant, when = record.plant_configuration, record.plant_mono_ns
+    at = np.clip(np.searchsorted(when, record.frame_mono_ns), 1, len(when) - 1)
+    share = (record.frame_mono_ns - when[at - 1]) / (when[at] - when[at - 1])
+    share = np.clip(share, 0.0, 1.0)[:, None, None]
+    return angle_between_deg(record.configuration, (1 - share) * plant[at - 1] + share * plant[at])
+
+
+# ---- Verdict ------------------------------------------------------------------------------------------------------
+
+
+def at_most(name: str, found: float, limit: float, unit: str = "", timing: bool = False) -> Acceptance:
+    """A line that holds when found <= limit; NaN never holds."""
+    return Acceptance(name, f"{found:.4g}{unit}", f"<= {limit:g}{unit}", bool(found <= limit), timing)
+
+
+def acceptances(record: Record) -> list[Acceptance]:
+    """Every acceptance of the run, timing ones marked."""
+    count = len(record.tick)
+    late_ms = percentile(record.lateness_ms, 99)
+    unacknowledged = int(np.isnan(record.acknowledged_ms).sum())
+    acknowledged = record.acknowledged_ms[~np.isnan(record.acknowledged_ms)]
+    differences = valve_difference(record)
+    running = [event for event in record.board_events if count and event["mono_ns"] >= record.mono_ns[0]]
+    watchdogs = sum(event["event"] == "watchdog" for event in record.board_events)
+    faulty = [f"0x{value:04x}" for value in np.unique(record.faults[record.faults != 0])]
+    not_running = [state for state in record.state if state != "RUNNING"]
+    lines = [
+        Acceptance("exit code of modsoft-runtime", str(record.runtime_exit), "0", record.runtime_exit == 0),
+        Acceptance("ticks", str(count), str(record.steps), count == record.steps),
+        at_most("missed ticks", record.missed, MISSED_TICKS, timing=True),
+        at_most("ticks held for want of a good tracker frame", record.held, HELD_TICKS, timing=True),
+        Acceptance(
+            "lateness of a tick, 99th percentile",
+            f"{late_ms:.2f} ms",
+            f"< {LATENESS_P99_MS:g} ms",
+            late_ms < LATENESS_P99_MS,
+            True,
+        ),
+        at_most("set-points never acknowledged", unacknowledged, 0, timing=True),
+        at_most("set-point to acknowledgement, 99th percentile", percentile(acknowledged, 99), ACKNOWLEDGED_P99_MS,
+                " ms", timing=True),
+        at_most("valve outputs off the log, worst of every tick and channel", _worst(differences), VALVE_COUNTS,
+                " counts"),
+        at_most("ticks without time for the valves to settle", int(np.isnan(differences).sum()), 0),
+        Acceptance("faults of the board", ", ".join(faulty) or "none", "none", not faulty),
+        at_most("ticks that the board did not follow", len(not_running), 0),
+        at_most("resets in the run", sum(event["event"] == "reset" for event in running), 0),
+        at_most("watchdog resets", watchdogs, 0),
+        at_most("bytes dropped by the board's receiver", record.board_summary.get("rx_dropped", math.nan),
+                DROPPED_BYTES),
+        at_most("largest duty at the end", float(np.max(record.valves.duty[-1], initial=0.0))
+                if len(record.valves.duty) else math.nan, 0.0),
+        at_most("highest chamber pressure at the end", float(np.max(record.plant_bar[-1]))
+                if len(record.plant_bar) else math.nan, CHAMBERS_AT_END_BAR, " bar"),
+    ]  # fmt: skip
+    if count and len(record.plant_mono_ns) > 1:
+        off = measured_off_deg(record)
+        lines.append(at_most("configuration used, off the plant's own", _worst(off), MEASURED_OFF_DEG, "°"))
+        mean = np.nanmean(tracking_error_deg(record), axis=0)
+        for module, limit in enumerate(TRACKING_DEG.get((record.task, record.robot.modules), [])):
+            name = f"tracking error of module {module + 1}, mean"
+            lines.append(at_most(name, float(mean[module]), limit, "°", timing=True))
+    else:
+        lines.append(Acceptance("configuration used, off the plant's own", "no ticks", "some", False))
+    return lines
+
+
+def witnesses(record: Record) -> list[Acceptance]:
+    """Whether the board and the plant were real time."""
+    board_ms = record.board_summary.get("late_max_ms", math.nan)
+    plant_ms = float(np.max(record.plant_late_ms)) if len(record.plant_late_ms) else math.nan
+    return [
+        at_most("emulated board behind real time, at most", board_ms, BOARD_LATE_MS, " ms"),
+        at_most("simulated robot behind real time, at most", plant_ms, PLANT_LATE_MS, " ms"),
+    ]
+
+
+def judge(record: Record) -> Verdict:
+    """Passed only when every acceptance holds on a host that kept up, in a run long enough to say so."""
+    lines, seen = acceptances(record), witnesses(record)
+    slow = [line for line in seen if not line.ok]
+    broken = [line for line in lines if not line.ok and not (line.timing and slow)]
+    if broken:
+        return Verdict("failed", "; ".join(f"{line.name} {line.found}" for line in broken), lines, seen)
+    if slow:
+        why = "; ".join(f"{line.name} {line.found} ({line.limit})" for line in slow)
+        return Verdict("not judged", f"the host was too slow: {why}", lines, seen)
+    if record.steps < FEWEST_TICKS:
+        return Verdict("not judged", f"{record.steps} ticks, at least {FEWEST_TICKS} are needed", lines, seen)
+    return Verdict("passed", "", lines, seen)
+
+
+def _worst(values: Array) -> float:
+    return float(np.nanmax(values)) if np.isfinite(values).any() else math.nan
