@@ -38,8 +38,8 @@ def save(checkpoint: dict[str, Any], path: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def load(path: Path) -> dict[str, Any]:
-    """Reads a checkpoint; `ModelError` says what was found when it is none."""
+def read(path: Path) -> dict[str, Any]:
+    """Whatever dict torch stored at `path`, unchecked: a checkpoint, or a bare state dict."""
     if not path.is_file():
         raise ModelError(f"no model file {path}; modsoft-train --out {path} makes one")
     try:
@@ -49,6 +49,12 @@ def load(path: Path) -> dict[str, Any]:
         raise ModelError(f"{path}: not a checkpoint of modsoft-train ({first})") from error
     if not isinstance(checkpoint, dict):
         raise ModelError(f"{path}: holds a {type(checkpoint).__name__}, expected a checkpoint of modsoft-train")
+    return checkpoint
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Reads a checkpoint; `ModelError` says what was found when it is none."""
+    checkpoint = read(path)
     missing = [key for key in KEYS if key not in checkpoint]
     if missing:
         raise ModelError(f"{path}: no {', '.join(missing)} in it, expected a checkpoint of modsoft-train")

@@ -1,0 +1,204 @@
+"""The checks between a written model file and the network it was made from. Each raises `ModelError`.
+
+A file passes all of them or is not kept: one alone is not enough. Comparing outputs alone, for instance, overlooks
+most single changed weights, and the fused form alone never feeds a neighbour's state.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+
+from modsoft.export import graph
+from modsoft.runtime.artefact import ACTUATION, FEATURES, FROM_NEIGHBOURS, IR_VERSION, OPSET, TO_NEIGHBOURS
+from modsoft.runtime.configuration import labels
+from modsoft.runtime.controller import Unit
+from modsoft.runtime.errors import ModelError
+from modsoft.training.networks import BiLSTM
+
+MODULES = (2, 3, 4, 5, 6, 7, 8, 16, 64)
+GOLDEN_MODULES = (2, 6)
+DRAWS = 4  # feature sets for each number of modules
+SEED = 20240229
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What torch says in float64, and how far float32 may be from it."""
+
+    features: dict[int, list[Array]]  # by number of modules: DRAWS of (N, F), float32 values
+    actuation: dict[int, list[Array]]  # the same of (N, A)
+    torch_error: float  # float32's own error in torch, share of the output range
+    output_range: float  # largest minus smallest actuation
+
+    @property
+    def bound(self) -> float:
+        """Largest permitted error, share of the output range: trained weights amplify float32's rounding, so a fixed
+        small bound would refuse correct files; beyond 1e-3 no file is good enough."""
+        return min(max(1e-5, 10.0 * self.torch_error), 1e-3)
+
+    @property
+    def tolerance(self) -> float:
+        """The bound in units of actuation."""
+        return self.bound * self.output_range
+
+    def error(self, found: dict[int, list[Array]]) -> dict[int, float]:
+        """Largest error for each number of modules, share of the output range."""
+        return {
+            modules: max(np.abs(f - a).max() for f, a in zip(draws, self.actuation[modules], strict=True))
+            / self.output_range
+            for modules, draws in found.items()
+        }
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the checks measured, share of the output range, by number of modules."""
+
+    bound: float
+    torch_error: float
+    fused: dict[int, float]
+    chain: dict[int, float]
+    one_sweep_fewer: dict[int, float]
+
+
+def draw(modules: int, feature_size: int, generator: np.random.Generator) -> Array:
+    """Features (N, F) with states and actions uniform in [-1, 1] and the true labels, in float32's values."""
+    features = generator.uniform(-1.0, 1.0, (modules, feature_size))
+    features[:, -1] = labels(modules)
+    return features.astype(np.float32).astype(np.float64)
+
+
+def reference(network: BiLSTM) -> Reference:
+    """Runs the network in float64 and float32 on the drawn features of every number of modules."""
+    generator = np.random.default_rng(SEED)
+    exact = copy.deepcopy(network).double()
+    features = {n: [draw(n, network.lstm.input_size, generator) for _ in range(DRAWS)] for n in MODULES}
+    with torch.no_grad():
+        actuation = {n: [exact(torch.from_numpy(x)[None])[0].numpy() for x in draws] for n, draws in features.items()}
+        rounded = {
+            n: [network(torch.from_numpy(x).float()[None])[0].double().numpy() for x in draws]
+            for n, draws in features.items()
+        }
+    everything = np.concatenate([a for draws in actuation.values() for a in draws])
+    output_range = float(np.ptp(everything))
+    if not np.isfinite(everything).all() or not output_range > 0.0:
+        raise ModelError(
+            f"the network's actuation spans {output_range} over all drawn features, expected it to be finite and to "
+            f"depend on them; train it again"
+        )
+    unscaled = Reference(features, actuation, 0.0, output_range)
+    return Reference(features, actuation, max(unscaled.error(rounded).values()), output_range)
+
+
+def weights_sha256(weights: graph.Weights) -> str:
+    """SHA-256 over names, shapes and bytes of a state dict, in the order of the names."""
+    digest = hashlib.sha256()
+    for name in sorted(weights):
+        digest.update(f"{name} {weights[name].shape}\n".encode())
+        digest.update(np.ascontiguousarray(weights[name], dtype="<f4").tobytes())
+    return digest.hexdigest()
+
+
+def verify(path: Path, network: BiLSTM, expected: Reference) -> Report:
+    """All checks of the file at `path` against the network; `expected` is `reference(network)`."""
+    weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+    layers = network.lstm.num_layers
+    check_graph(path)
+    check_weights(path, weights, layers)
+    unit = Unit(path.read_bytes(), str(path))
+    fused = check_fused(unit, expected)
+    chain, one_sweep_fewer = check_chain(unit, expected)
+    check_guard(unit, expected)
+    return Report(expected.bound, expected.torch_error, fused, chain, one_sweep_fewer)
+
+
+def check_graph(path: Path) -> None:
+    """The file is ONNX by the standard's own checker, shapes inferred, of the declared opset and IR version."""
+    try:
+        onnx.checker.check_model(path, full_check=True)
+        model = onnx.load(path)
+    except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError, ValueError) as error:
+        raise ModelError(f"the graph is not valid ONNX: {str(error).splitlines()[0]}") from error
+    found = (model.ir_version, [(entry.domain, entry.version) for entry in model.opset_import])
+    if found != (IR_VERSION, [("", OPSET)]):
+        raise ModelError(f"the graph is of IR version and opset {found}, expected {IR_VERSION} and {OPSET}")
+
+
+def check_weights(path: Path, weights: graph.Weights, layers: int) -> None:
+    """Every weight, read back with the gate order undone, is bitwise the checkpoint's."""
+    try:
+        found = graph.weights_of(onnx.load(path), layers)
+    except (KeyError, ValueError) as error:
+        raise ModelError(f"the graph lacks weights that the checkpoint has: {error}") from error
+    if sorted(found) != sorted(weights):
+        raise ModelError(f"the graph holds the weights {sorted(found)}, expected {sorted(weights)}")
+    for name, expected in weights.items():
+        if found[name].dtype != expected.dtype or found[name].shape != expected.shape:
+            raise ModelError(f"weight {name}: {found[name].dtype} {found[name].shape}, expected {expected.shape}")
+        changed = int((found[name].view(np.uint32) != expected.view(np.uint32)).sum())
+        if changed:
+            raise ModelError(f"weight {name}: {changed} of {expected.size} values are not the checkpoint's")
+
+
+def check_fused(unit: Unit, expected: Reference) -> dict[int, float]:
+    """All modules in one run give torch's actuation."""
+    found = {n: [unit.whole(x) for x in draws] for n, draws in expected.features.items()}
+    return _within(expected.error(found), expected.bound, "all modules in one run")
+
+
+def check_chain(unit: Unit, expected: Reference) -> tuple[dict[int, float], dict[int, float]]:
+    """A chain of single modules gives the same after L + 1 sweeps, and, so that this proves that neighbours are
+    heard at all, something else after L."""
+    first = {n: draws[0] for n, draws in expected.features.items()}
+    one = Reference(expected.features, {n: a[:1] for n, a in expected.actuation.items()}, 0.0, expected.output_range)
+    found = {n: [unit.chain(x)] for n, x in first.items()}
+    chain = _within(one.error(found), expected.bound, "a chain of single modules")
+    fewer = one.error({n: [unit.chain(x, sweeps=unit.layers)] for n, x in first.items()})
+    if not max(fewer.values()) > expected.bound:
+        raise ModelError(
+            f"a chain of single modules is within {max(fewer.values()):.1e} of the output range after {unit.layers} "
+            f"sweeps already, expected it to need {unit.layers + 1}: neighbours' states make no difference"
+        )
+    return chain, fewer
+
+
+def check_guard(unit: Unit, expected: Reference) -> None:
+    """A NaN or an infinity in any feature or any neighbour's state gives NaN in every output at every module."""
+    features = expected.features[3][0].astype(np.float32)
+    states = {name: np.zeros((unit.layers, 1, unit.hidden), dtype=np.float32) for name in FROM_NEIGHBOURS}
+    for bad in (np.nan, np.inf, -np.inf):
+        for index in range(unit.feature_size):
+            spoilt = features.copy()
+            spoilt[index % len(spoilt), index] = bad
+            _all_nan(unit, {FEATURES: spoilt[None]}, f"feature {index}")
+        for name, state in states.items():
+            for layer in range(unit.layers):
+                spoilt = state.copy()
+                spoilt[layer, 0, layer % unit.hidden] = bad
+                _all_nan(unit, {FEATURES: features[None], **states, name: spoilt}, f"{name} of layer {layer + 1}")
+
+
+def _all_nan(unit: Unit, inputs: dict[str, NDArray[np.float32]], where: str) -> None:
+    for name, output in zip((ACTUATION, *TO_NEIGHBOURS), unit.session.run(None, inputs), strict=True):
+        if not np.isnan(output).all():
+            raise ModelError(f"a value that is not finite in {where} leaves {name} looking sound, expected NaN")
+
+
+def _within(errors: dict[int, float], bound: float, what: str) -> dict[int, float]:
+    for modules, error in errors.items():
+        if not error <= bound:
+            raise ModelError(
+                f"{what}: {modules} modules differ from torch by {error:.1e} of the output range, "
+                f"expected at most {bound:.1e}"
+            )
+    return errors

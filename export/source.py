@@ -1,0 +1,102 @@
+"""What is exported: a checkpoint of modsoft-train, or a bare state dict with a meta file that says the rest."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import torch
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.configuration import feature_names
+from modsoft.runtime.errors import ModelError
+from modsoft.training import checkpoint as checkpoints
+
+UNTOLD = (
+    "robot (file or shipped name: kind, period, modules trained on), history (time steps T), label (base-to-tip), "
+    "feature order (kind)"
+)
+
+
+class MetaFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """TOML beside a bare state dict: what the shapes of its tensors cannot tell."""
+
+    robot: str  # a robot file, relative to the meta file, or a shipped robot's name
+    history: int
+    label: Literal["base -1, tip +1"]
+    features: Literal["states and actions by time step, then label"]
+    provenance: dict[str, Any] = {}
+
+
+def read(path: Path, meta: Path | None = None) -> dict[str, Any]:
+    """The checkpoint at `path`, checked against itself; with `meta`, one made of a bare state dict."""
+    if meta is None:
+        content = checkpoints.read(path)
+        if content and all(isinstance(value, torch.Tensor) for value in content.values()):
+            raise ModelError(
+                f"{path}: a bare state dict; its shapes cannot tell {UNTOLD}; say them in a TOML file: --meta FILE"
+            )
+        found = checkpoints.load(path)
+    else:
+        found = _with_meta(path, meta)
+    _check(found, path)
+    return found
+
+
+def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
+    try:
+        said = msgspec.convert(tomllib.loads(meta.read_text(encoding="utf-8")), MetaFile)
+    except OSError as error:
+        raise ModelError(f"{meta}: cannot be read ({error.strerror})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+        raise ModelError(f"{meta}: {error}; expected {UNTOLD}") from error
+    weights = checkpoints.read(path)
+    if not all(isinstance(value, torch.Tensor) for value in weights.values()):
+        raise ModelError(f"{path}: a checkpoint that says all itself, expected a bare state dict; leave --meta out")
+    layers = sum(name.startswith("lstm.weight_hh_l") and not name.endswith("_reverse") for name in weights)
+    needed = ("lstm.weight_ih_l0", "lstm.weight_hh_l0", "head.weight")
+    missing = [name for name in needed if name not in weights or weights[name].ndim != 2]
+    if missing:
+        raise ModelError(f"{path}: no matrix {', '.join(missing)} in it, expected the state dict of the biLSTM")
+    beside = meta.parent / said.robot
+    robot = robots.load(beside if beside.is_file() else said.robot)
+    return {
+        "schema": checkpoints.SCHEMA,
+        "robot": robot.to_dict(),
+        "network": {
+            "name": "bilstm",
+            "feature_size": weights["lstm.weight_ih_l0"].shape[1],
+            "action_size": weights["head.weight"].shape[0],
+            "layers": layers,
+            "hidden": weights["lstm.weight_hh_l0"].shape[1],
+            "dropout": 0.0,
+            "history": said.history,
+        },
+        "features": feature_names(robot.robot.kind, said.history),
+        "weights": weights,
+        "provenance": said.provenance,
+    }
+
+
+def _check(checkpoint: dict[str, Any], path: Path) -> None:
+    """What the checkpoint says of itself holds together, and its weights are finite float32."""
+    robot = robots.from_dict(checkpoint["robot"], f"{path}: robot")
+    network, kind = checkpoint["network"], robot.robot.kind
+    if network.get("name") != "bilstm":
+        raise ModelError(f"{path}: network {network.get('name')!r}, expected 'bilstm'; no other can be exported")
+    expected = feature_names(kind, network["history"])
+    if list(checkpoint["features"]) != expected:
+        raise ModelError(f"{path}: features {list(checkpoint['features'])}, expected for {kind} {expected}")
+    for name, found, wanted in (
+        ("feature_size", network["feature_size"], len(expected)),
+        ("action_size", network["action_size"], robot.action_size),
+    ):
+        if found != wanted:
+            raise ModelError(f"{path}: {name} {found}, expected {wanted} for {kind} and history {network['history']}")
+    for name, tensor in checkpoint["weights"].items():
+        if tensor.dtype != torch.float32:
+            raise ModelError(f"{path}: weight {name} is {tensor.dtype}, expected torch.float32")
+        if not torch.isfinite(tensor).all():
+            raise ModelError(f"{path}: weight {name} is not finite; train it again")

@@ -1,0 +1,91 @@
+"""From a checkpoint to a model file: written under a temporary name, checked as read back from there, then renamed."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from modsoft.export import graph, parity, source
+from modsoft.runtime import artefact
+from modsoft.runtime import robot as robots
+from modsoft.runtime.artefact import Description, Golden, Network
+from modsoft.runtime.controller import Controller
+from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.training import checkpoint as checkpoints
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A model file that passed every check."""
+
+    path: Path
+    description: Description
+    report: parity.Report
+
+
+def export(model: str | Path, out: str | Path | None = None, meta: str | Path | None = None) -> Exported:
+    """Exports the checkpoint `model` to `out`, by default `model.onnx` beside it.
+
+    Raises `ModelError` when the checkpoint or the file made of it fails a check; then nothing is left, and a file
+    that stood at `out` before stands there still.
+    """
+    model = Path(model)
+    out = model.with_suffix(".onnx") if out is None else Path(out)
+    if not out.parent.is_dir() or out.is_dir():
+        raise UsageError(f"--out {out}: expected a file in a folder that is there")
+    checkpoint = source.read(model, None if meta is None else Path(meta))
+    network = checkpoints.network_of(checkpoint)
+    expected = parity.reference(network)
+    weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+    described = describe(checkpoint, weights, expected)
+    try:
+        text = msgspec.json.encode(described).decode()
+    except TypeError as error:
+        raise ModelError(f"{model}: provenance that is no plain value ({error})") from error
+    content = artefact.sealed(graph.build(weights, network.lstm.num_layers, text).SerializeToString())
+
+    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(content)
+        report = parity.verify(temporary, network, expected)
+        described = Controller.load(temporary).description  # as the lab PC will, golden pairs included
+        os.replace(temporary, out)
+    except ModelError as error:
+        raise ModelError(f"{out} not written: {str(error).replace(str(temporary), out.name)}") from error
+    except OSError as error:
+        raise ModelError(f"{out} not written: {error.strerror}; make room or choose another --out") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return Exported(out, described, report)
+
+
+def describe(checkpoint: dict[str, Any], weights: graph.Weights, expected: parity.Reference) -> Description:
+    """The description of the model to be, its seal not yet set."""
+    robot, network = robots.from_dict(checkpoint["robot"]), checkpoint["network"]
+    return Description(
+        schema=artefact.SCHEMA,
+        file_sha256=artefact.UNSEALED,
+        weights_sha256=parity.weights_sha256(weights),
+        opset=artefact.OPSET,
+        ir_version=artefact.IR_VERSION,
+        sequence_axis="modules",
+        kind=robot.robot.kind,
+        state_size=robot.state_size,
+        action_size=robot.action_size,
+        period_s=robot.loop.period_s,
+        modules_trained_on=[robot.modules],
+        features=list(checkpoint["features"]),
+        label=artefact.LABEL,
+        network=Network(**{field: network[field] for field in Network.__struct_fields__}),
+        tolerance=expected.tolerance,
+        golden=[
+            Golden(features=expected.features[n][0].tolist(), actuation=expected.actuation[n][0].tolist())
+            for n in parity.GOLDEN_MODULES
+        ],
+        robot=checkpoint["robot"],
+        provenance=checkpoint["provenance"],
+    )

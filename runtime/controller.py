@@ -1,0 +1,200 @@
+"""The controller: the exported biLSTM unit, run over all modules of the robot in one go or as a chain of units.
+
+`Controller.load` believes nothing: the seal, the description, the graph's border and the golden pairs are all proven
+before the first control step, and `check` proves that model and robot belong together.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import ArrayLike, NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state as onnxruntime_errors
+
+from modsoft.runtime import artefact, configuration
+from modsoft.runtime.artefact import ACTUATION, FEATURES, FROM_NEIGHBOURS, TO_NEIGHBOURS, Description
+from modsoft.runtime.errors import ModelError
+from modsoft.runtime.robot import KINDS, Robot
+
+Array = NDArray[np.float64]
+
+# What a session raises for a graph that it cannot take.
+REFUSED = (
+    onnxruntime_errors.Fail,
+    onnxruntime_errors.InvalidArgument,
+    onnxruntime_errors.InvalidGraph,
+    onnxruntime_errors.InvalidProtobuf,
+    onnxruntime_errors.NotImplemented,
+    onnxruntime_errors.RuntimeException,
+)
+
+
+class Unit:
+    """The graph over a segment of contiguous modules, in onnxruntime (Figure 1-(D))."""
+
+    def __init__(self, model: bytes, where: str = "model"):
+        """`model`: a serialised ONNX model; `where` is named in the errors."""
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1  # more gains nothing below 16 modules, and collapses beside a busy process
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        try:
+            self.session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        except REFUSED as error:
+            first = str(error).splitlines()[0]
+            raise ModelError(f"{where}: onnxruntime {onnxruntime.__version__} refuses it ({first})") from error
+        self.where = where
+        self._check_border()
+        self.feature_size: int = self.session.get_inputs()[0].shape[2]
+        self.action_size: int = self.session.get_outputs()[0].shape[2]
+        self.layers, _, self.hidden = self.session.get_overridable_initializers()[0].shape
+
+    def _check_border(self) -> None:
+        session = self.session
+        inputs, states, outputs = session.get_inputs(), session.get_overridable_initializers(), session.get_outputs()
+        names = ([i.name for i in inputs], sorted(i.name for i in states), [o.name for o in outputs])
+        wanted = ([FEATURES], sorted(FROM_NEIGHBOURS), [ACTUATION, *TO_NEIGHBOURS])
+        if names != wanted:
+            raise ModelError(f"{self.where}: inputs, states, outputs are {names}, expected {wanted}; export it again")
+        exchanged = {tuple(value.shape) for value in [*states, *outputs[1:]]}
+        if len(exchanged) != 1 or any(len(value.shape) != 3 for value in [*inputs, *outputs]):
+            raise ModelError(f"{self.where}: states of shapes {sorted(exchanged)}, expected one shape (L, 1, H)")
+        modules = {str(value.shape[1]) for value in (inputs[0], outputs[0])}
+        if modules != {"N"}:
+            raise ModelError(f"{self.where}: made for {modules} modules, expected any number N; export it again")
+
+    def whole(self, features: ArrayLike) -> Array:
+        """Features (N, F) of all modules to actuation (N, A): one run, no neighbours beyond the ends."""
+        segment = np.asarray(features, dtype=np.float32)[None]
+        return self.session.run([ACTUATION], {FEATURES: segment})[0][0].astype(np.float64)
+
+    def chain(self, features: ArrayLike, sweeps: int | None = None) -> Array:
+        """The same by single modules that know only their neighbours' states, in alternating sweeps, base to tip first.
+
+        In a stack of L layers both directions of a layer feed the next, so L + 1 sweeps (the default) reach the
+        result of `whole`, fewer do not.
+        """
+        segment = np.asarray(features, dtype=np.float32)
+        modules = len(segment)
+        received: list[dict[str, NDArray[np.float32]]] = [{} for _ in range(modules)]
+        actuation = np.zeros((modules, self.action_size))
+        for sweep in range(self.layers + 1 if sweeps is None else sweeps):
+            for i in range(modules) if sweep % 2 == 0 else reversed(range(modules)):
+                outputs = self.session.run(None, {FEATURES: segment[None, i : i + 1], **received[i]})
+                actuation[i] = outputs[0][0, 0]
+                if i + 1 < modules:
+                    received[i + 1].update(h_from_base=outputs[1], c_from_base=outputs[2])
+                if i > 0:
+                    received[i - 1].update(h_from_tip=outputs[3], c_from_tip=outputs[4])
+        return actuation
+
+
+class Controller:
+    """A model file, proven and ready to run. `description` says what it is, `history` is its T."""
+
+    def __init__(self, unit: Unit, description: Description):
+        self.unit = unit
+        self.description = description
+        self.where = unit.where
+
+    @classmethod
+    def load(cls, path: str | Path) -> Controller:
+        """Opens a model file; `ModelError` for one that is damaged, of another schema, at odds with its own
+        description, or that answers the golden pairs otherwise than torch did."""
+        path = Path(path)
+        unit = Unit(artefact.read(path), str(path))
+        text = unit.session.get_modelmeta().custom_metadata_map.get(artefact.METADATA_KEY)
+        if text is None:
+            raise ModelError(f"{path}: no metadata {artefact.METADATA_KEY!r} in it, expected a file of modsoft-export")
+        controller = cls(unit, artefact.describe(text, str(path)))
+        controller._check_description()
+        controller._replay()
+        return controller
+
+    @property
+    def history(self) -> int:
+        """Time steps T of the feature window."""
+        return self.description.network.history
+
+    def _check_description(self) -> None:
+        """The description against the graph it stands in, and against this runtime's feature layout."""
+        said, network, kind = self.description, self.description.network, KINDS.get(self.description.kind)
+        if kind is None:
+            raise ModelError(f"{self.where}: for a robot of kind {said.kind!r}, expected one of {', '.join(KINDS)}")
+        pairs = {
+            "opset": (said.opset, artefact.OPSET),
+            "IR version": (said.ir_version, artefact.IR_VERSION),
+            "label": (said.label, artefact.LABEL),
+            "state size": (said.state_size, len(kind.state)),
+            "action size": (said.action_size, len(kind.action)),
+            "actuation of the graph": (self.unit.action_size, said.action_size),
+            "features of the graph": (self.unit.feature_size, len(said.features)),
+            "network": (
+                (network.feature_size, network.action_size, network.layers, network.hidden),
+                (self.unit.feature_size, self.unit.action_size, self.unit.layers, self.unit.hidden),
+            ),
+            "features": (said.features, configuration.feature_names(said.kind, network.history)),
+        }
+        for name, (found, expected) in pairs.items():
+            if found != expected:
+                raise ModelError(f"{self.where}: {name} {found}, expected {expected}; export it again")
+        if not said.golden:
+            raise ModelError(f"{self.where}: no golden pair in it, expected one or more; export it again")
+
+    def _replay(self) -> None:
+        """The golden pairs: this machine's onnxruntime must answer as torch did where the model was exported."""
+        for pair in self.description.golden:
+            expected = np.array(pair.actuation)
+            found = self.actuate(pair.features)
+            error = np.abs(found - expected).max() if found.shape == expected.shape else np.inf
+            if not error <= self.description.tolerance:
+                raise ModelError(
+                    f"{self.where}: a golden pair of {len(pair.features)} modules comes out {error:.2e} off, expected "
+                    f"at most {self.description.tolerance:.2e}; export it again, or install another onnxruntime than "
+                    f"{onnxruntime.__version__}"
+                )
+
+    def check(self, robot: Robot) -> None:
+        """Raises `ModelError` unless the model was trained for robots like this one; their module number is free."""
+        said = self.description
+        pairs = {
+            "kind": (said.kind, robot.robot.kind),
+            "state size": (said.state_size, robot.state_size),
+            "action size": (said.action_size, robot.action_size),
+            "period_s": (said.period_s, robot.loop.period_s),
+        }
+        wrong = [name for name, (found, expected) in pairs.items() if found != expected]
+        if "period_s" in wrong and np.isclose(said.period_s, robot.loop.period_s, rtol=1e-6, atol=0.0):
+            wrong.remove("period_s")
+        if wrong:
+            found, expected = (", ".join(f"{name} {pairs[name][side]}" for name in wrong) for side in (0, 1))
+            raise ModelError(
+                f"{self.where}: trained for {found}; robot {robot.name} has {expected}; "
+                f"give the model (--model) or the robot file (--robot) that belongs to the other"
+            )
+
+    def warm_up(self, modules: int) -> None:
+        """Runs a few steps of a robot of this many modules, so that the first control step is not the slow one."""
+        for _ in range(3):
+            self.actuate(np.zeros((modules, self.unit.feature_size)))
+
+    def actuate(self, features: ArrayLike) -> Array:
+        """Features (N, F) of this control step to actuation (N, A), not limited. Raises `ModelError` for fewer than
+        two modules, another number of features, or anything not finite, in or out."""
+        with np.errstate(over="ignore"):  # a value too large for float32 is infinite there, and refused below
+            narrowed = np.asarray(features, dtype=np.float64).astype(np.float32)
+        if narrowed.ndim != 2 or narrowed.shape[0] < 2 or narrowed.shape[1] != self.unit.feature_size:
+            raise ModelError(
+                f"{self.where}: features of shape {narrowed.shape}, expected (N, {self.unit.feature_size}) with N >= 2"
+            )
+        finite = np.isfinite(narrowed)
+        if not finite.all():
+            module, feature = np.argwhere(~finite)[0]
+            name = self.description.features[feature]
+            raise ModelError(f"{self.where}: feature {name} of module {module + 1} is not finite; nothing was computed")
+        actuation = self.unit.whole(narrowed)
+        if not np.isfinite(actuation).all():
+            raise ModelError(f"{self.where}: the actuation is not finite although every feature is")
+        return actuation
