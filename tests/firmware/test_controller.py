@@ -1,0 +1,425 @@
+"""States, timers, refusals and outputs of the firmware, on virtual time."""
+
+from __future__ import annotations
+
+import zlib
+
+import pytest
+
+from modsoft.runtime import protocol
+from modsoft.runtime.protocol import ClearFault, Fault, Hello, HelloReq, NackReason, State, Status, Vent, VentMode
+
+FULL = (3500,) * 6
+
+
+def reason(answers):
+    nacks = [answer for answer in answers if isinstance(answer, protocol.Nack)]
+    assert len(nacks) == 1, answers
+    return NackReason(nacks[0].reason)
+
+
+def until_vented(board, limit_ms=2000):
+    """Milliseconds until every output is 0, with nothing said by the host."""
+    for elapsed in range(limit_ms):
+        if not any(board.applied):
+            return elapsed
+        board.wait(1)
+    raise AssertionError(f"not vented after {limit_ms} ms: {board.applied}")
+
+
+def test_hello_comes_unasked_once_and_first(board):
+    first, *rest = [frame.message for frame in board.messages()]
+    assert isinstance(first, Hello)
+    assert rest == []
+    assert first.protocol_hash == protocol.PROTOCOL_HASH
+    assert (first.boot_id, first.reset_cause) == (0xB0A4D, protocol.ResetCause.POWER_ON)
+    assert (first.channels, first.sensors) == (11, 0x3F)
+    assert (first.p_min, first.p_max, first.p_full, first.slew) == (800, 3500, 30000, 20000)
+    assert (first.link_timeout_ms, first.control_timeout_ms) == (300, 1000)
+    assert board.state == State.BOOT
+    answers = []
+    for _ in range(10):
+        board.wait(100)
+        answers += [frame.message for frame in board.messages()]
+    assert board.state == State.IDLE
+    assert all(isinstance(answer, Status) for answer in answers)
+    assert len(answers) == 10
+
+
+def test_hello_on_request_in_any_state(running):
+    assert any(isinstance(answer, Hello) for answer in running.tell(HelloReq(protocol.PROTOCOL_HASH)))
+    assert running.state == State.RUNNING
+
+
+def test_foreign_hello_request_is_answered_and_refused(board):
+    answers = board.tell(HelloReq(protocol.PROTOCOL_HASH ^ 1))
+    assert isinstance(answers[0], Hello)
+    assert reason(answers) == NackReason.HASH
+
+
+def test_status_tells_it_all(running):
+    running.wait(100)
+    status = [frame.message for frame in running.messages()][-1]
+    assert status.state == State.RUNNING
+    assert status.applied[:6] == (3500, 800, 800, 2000, 800, 800)
+    assert status.measured == (3500, 800, 800, 2000, 800, 800) + (protocol.NOT_MEASURED,) * 6
+    assert status.tick == running.tick
+    assert status.acked_seq == running.seq
+    assert status.uptime_ms == running.now_ms
+    assert status.supply_mv == 5000
+    assert (status.rx_bad, status.rx_refused) == (0, 0)
+
+
+def test_every_pass_reports_every_check(running):
+    running.wait(1)
+    assert running.update() == 15
+
+
+# ---- arming
+
+
+def test_arm_needs_a_second_of_heartbeats(board):
+    board.beat(1000)
+    board.now_ms -= 1
+    assert reason(board.arm()) == NackReason.STATE
+    board.now_ms += 1
+    board.arm()
+    assert board.state == State.ARMED
+    assert board.counts == [0] * 12
+
+
+def test_arm_needs_unbroken_heartbeats(board):
+    board.beat(900)
+    board.wait(301)
+    board.beat(300)
+    assert reason(board.arm()) == NackReason.STATE
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"protocol_hash": 1}, NackReason.HASH),
+        ({"boot_id": 7}, NackReason.SESSION),
+        ({"new_session": 2}, NackReason.SESSION),
+        ({"new_session": 0}, NackReason.SESSION),
+        ({"channels": 0x800}, NackReason.RANGE),
+        ({"p_full": 100000}, NackReason.RANGE),
+    ],
+)
+def test_arm_refused(board, changes, expected):
+    board.beat(1100)
+    assert reason(board.arm(**changes)) == expected
+    assert board.state == State.IDLE
+
+
+def test_arm_again_is_the_same_session(board):
+    board.beat(1100)
+    board.arm()
+    (again,) = board.arm(new_session=1)
+    assert isinstance(again, Status)
+    assert board.state == State.ARMED
+
+
+def test_arm_refused_while_running_and_old_arm_after(running):
+    assert reason(running.arm()) == NackReason.STATE
+    running.tell(Vent(VentMode.DUMP))
+    running.beat(1100)
+    assert reason(running.arm(new_session=1)) == NackReason.SESSION
+    running.arm()
+    assert running.state == State.ARMED
+
+
+def test_arm_refused_before_vented(running):
+    running.beat(1000)
+    running.tell(Vent(VentMode.RAMP))
+    assert any(running.applied)
+    assert reason(running.arm()) == NackReason.STATE
+
+
+def test_sessions_go_round_and_skip_zero(board):
+    for session in [*range(1, 256), 1]:
+        board.beat(1000)
+        board.arm(new_session=session)
+        assert (board.state, board.session) == (State.ARMED, session)
+        board.tell(Vent(VentMode.DUMP))
+        board.messages()
+
+
+# ---- set-points
+
+
+def test_slew_and_clamp(board):
+    board.beat(1100)
+    board.arm()
+    board.set(*FULL)
+    worst = 0
+    for _ in range(200):
+        before = board.applied[0]
+        board.wait(1)
+        worst = max(worst, board.applied[0] - before)
+    assert worst == 20  # 2 bar/s
+    assert board.applied == [*FULL, 0, 0, 0, 0, 0, 0]
+
+
+def test_counts_are_the_pressure_over_full_scale(running):
+    assert running.counts == [round(pressure * 4096 / 30000) for pressure in running.applied]
+    for pressure in range(0, 3501, 7):
+        running.set(pressure)
+        running.beat(100)
+        running.follow()
+        running.beat(200)
+        running.follow()
+        assert abs(running.counts[0] - pressure * 4096 / 30000) <= 0.51
+
+
+@pytest.mark.parametrize("pressures", [(-1,), (3501,), (800, 32767), (0, 0, 0, 0, 0, 0, 800), (0,) * 11 + (800,)])
+def test_out_of_range_rejects_the_whole_frame(running, pressures):
+    before = [running.library.board_set_point(running.handle, channel) for channel in range(12)]
+    assert reason(running.set(*pressures)) == NackReason.RANGE
+    assert [running.library.board_set_point(running.handle, channel) for channel in range(12)] == before
+    assert running.state == State.RUNNING
+
+
+def test_set_refused_outside_a_session(board):
+    board.beat(1100)
+    assert reason(board.set(800)) == NackReason.STATE
+
+
+def test_set_and_heartbeat_of_another_session_refused(running):
+    assert reason(running.set(800, session=2)) == NackReason.SESSION
+    assert reason(running.tell(protocol.Heartbeat(99), session=0)) == NackReason.SESSION
+
+
+def test_sequence_window(running):
+    last = running.seq
+    for ahead in (9, 100, 128, 255):
+        assert reason(running.set(800, seq=(last + ahead) & 0xFF)) == NackReason.SEQUENCE
+    for ahead in (1, 8, 8, 8, 8):
+        last = (last + ahead) & 0xFF
+        (status,) = running.set(900, seq=last)
+        assert status.acked_seq == last
+
+
+def test_first_set_must_follow_the_arm(board):
+    board.beat(1100)
+    board.arm()
+    assert reason(board.set(800, seq=0)) == NackReason.SEQUENCE
+    assert board.state == State.ARMED
+    board.set(800, seq=1)
+    assert board.state == State.RUNNING
+
+
+def test_older_tick_refused(running):
+    running.set(800, tick=1000)
+    assert reason(running.set(900, tick=999)) == NackReason.SEQUENCE
+    running.set(1000, tick=1000, seq=(running.seq + 1) & 0xFF)
+    assert running.library.board_set_point(running.handle, 0) == 1000
+
+
+def test_duplicate_is_acknowledged_not_applied_and_feeds_nothing(running):
+    running.set(1000)
+    (status,) = running.set(2000, seq=running.seq)
+    assert status.acked_seq == running.seq
+    assert running.library.board_set_point(running.handle, 0) == 1000
+    for _ in range(31):
+        running.set(1000, seq=running.seq)
+        running.wait(10)
+    assert running.faults == Fault.LINK_TIMEOUT
+
+
+@pytest.mark.parametrize(("start_ms", "ticks"), [(0xFFFFFFFF - 1500, 0), (5, 0xFFFFFFF0)])
+def test_clock_and_tick_may_wrap(new_board, start_ms, ticks):
+    board = new_board(start_ms=start_ms)
+    board.tick = ticks
+    board.beat(1100)
+    board.arm()
+    for _ in range(30):
+        board.set(800)
+        board.follow()
+        board.wait(100)
+        board.follow()
+    assert (board.state, board.faults) == (State.RUNNING, Fault(0))
+
+
+# ---- length, type
+
+
+@pytest.mark.parametrize("extra", [-1, 1])
+@pytest.mark.parametrize("message", [protocol.Vent(0), protocol.Heartbeat(1), protocol.Set(1, (0,) * 12)])
+def test_wrong_length_refused(running, message, extra):
+    whole = protocol.cobs_decode(protocol.encode(message, 1, running.session)[1:-1])[:-4]
+    body = whole[:-1] if extra < 0 else whole + b"\0"
+    running.messages()
+    running.feed(b"\0" + with_crc(body) + b"\0")
+    assert reason([frame.message for frame in running.messages()]) == NackReason.LENGTH
+    assert running.state == State.RUNNING
+
+
+def test_unknown_type_refused(running):
+    for unknown in (0x00, 0x03, 0x7F, 0x81, 0x90, 0xFF):
+        running.messages()
+        running.feed(b"\0" + with_crc(bytes((unknown, 5, running.session))) + b"\0")
+        (frame,) = running.messages()
+        assert frame.message == protocol.Nack(unknown, 5, NackReason.TYPE)
+
+
+def with_crc(body):
+    return protocol.cobs_encode(body + zlib.crc32(body).to_bytes(4, "little"))
+
+
+# ---- timers and faults
+
+
+def test_host_gone_vents_in_time(running):
+    running.beat(100)
+    running.wait(200)  # 300 ms after the last heartbeat
+    assert running.state == State.RUNNING
+    running.wait(1)
+    assert (running.state, running.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
+    assert 301 + until_vented(running) <= 670
+    assert running.counts == [0] * 12
+
+
+def test_armed_host_gone_is_a_fault_too(board):
+    board.beat(1100)
+    board.arm()
+    board.wait(301)
+    assert (board.state, board.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
+
+
+def test_garbage_and_damaged_frames_do_not_feed_the_link(running):
+    good = protocol.encode(protocol.Heartbeat(1000), 0, running.session)
+    for _ in range(310):
+        running.feed(good[:5] + b"\x55" + good[6:] + b"\xaa\x00")
+        running.wait(1)
+    assert running.faults == Fault.LINK_TIMEOUT
+    running.wait(400)
+    running.messages()
+    assert isinstance(running.tell(HelloReq(protocol.PROTOCOL_HASH))[0], Hello)
+
+
+def test_stuck_control_loop_vents(running):
+    running.set(3500)
+    started = running.now_ms
+    while running.state == State.RUNNING:
+        running.beat(100, ticking=False)
+        running.follow()
+    assert running.faults == Fault.CONTROL_TIMEOUT
+    assert 1000 < running.now_ms - started <= 1100
+    assert running.now_ms - started + until_vented(running) <= 1400
+
+
+def test_latched_fault_needs_the_exact_mask_and_the_pressures_down(running):
+    running.wait(301)
+    assert running.faults == Fault.LINK_TIMEOUT
+    assert reason(running.set(800)) == NackReason.STATE
+    assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # still ramping
+    until_vented(running)
+    assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # sensors still up
+    running.measured[:6] = [499] * 6
+    running.wait(1)
+    for mask in (0, Fault.LINK_TIMEOUT | Fault.LEAK, Fault.CONTROL_TIMEOUT):
+        assert reason(running.tell(ClearFault(mask))) == NackReason.RANGE
+    running.tell(ClearFault(Fault.LINK_TIMEOUT))
+    assert (running.state, running.faults) == (State.IDLE, Fault(0))
+    assert reason(running.set(800)) == NackReason.STATE
+
+
+def test_clear_fault_without_fault_refused(running):
+    assert reason(running.tell(ClearFault(0))) == NackReason.STATE
+
+
+def test_over_pressure_dumps(running):
+    running.measured[3] = 4501
+    running.wait(99)
+    assert running.state == State.RUNNING
+    running.wait(1)
+    assert running.faults == Fault.OVER_PRESSURE
+    assert running.counts == [0] * 12
+
+
+def test_short_over_pressure_is_none(running):
+    for _ in range(5):
+        running.measured[3] = 4501
+        running.wait(99)
+        running.measured[3] = 2000
+        running.wait(1)
+        running.tell(protocol.Heartbeat(running.tick))
+    assert running.faults == Fault(0)
+
+
+def test_over_pressure_is_seen_while_idle_and_stays_latched(board):
+    board.measured[0] = 9000
+    board.wait(200)
+    assert board.faults == Fault.OVER_PRESSURE
+    assert reason(board.tell(ClearFault(Fault.OVER_PRESSURE))) == NackReason.STATE
+
+
+@pytest.mark.parametrize(("reading", "fault"), [(1499, Fault.LEAK), (2501, Fault.SENSOR)])
+def test_sensor_that_does_not_follow(running, reading, fault):
+    running.measured[3] = reading
+    started = running.now_ms
+    while running.state == State.RUNNING and running.now_ms - started < 3000:
+        running.beat(100)
+    assert running.faults == fault
+    assert 2000 <= running.now_ms - started <= 2100
+
+
+def test_sensor_slightly_off_is_no_fault(running):
+    running.measured[3] = 1500
+    running.beat(5000)
+    assert (running.state, running.faults) == (State.RUNNING, Fault(0))
+
+
+def test_channels_of_no_session_are_not_judged_for_leaks(board):
+    board.beat(1100)
+    board.arm(channels=0x03)
+    board.set(800, 800)
+    board.measured[:6] = [800, 800, 4000, 4000, 4000, 4000]
+    board.beat(5000)
+    assert board.state == State.RUNNING
+
+
+# ---- venting
+
+
+@pytest.mark.parametrize("session", [0, 77])
+def test_vent_ramps_from_any_session(running, session):
+    (status,) = running.tell(Vent(VentMode.RAMP), session=session)
+    assert status.state == State.IDLE
+    assert status.applied[0] == 3500
+    assert 160 <= until_vented(running) <= 180
+
+
+@pytest.mark.parametrize("mode", [VentMode.DUMP, 200])
+def test_dump_is_at_once(running, mode):
+    (status,) = running.tell(Vent(mode))
+    assert status.applied == (0,) * 12
+
+
+def test_vent_in_fault_stays_in_fault(running):
+    running.wait(301)
+    (status,) = running.tell(Vent(VentMode.DUMP))
+    assert (status.state, status.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
+    assert status.applied == (0,) * 12
+
+
+def test_nothing_that_a_host_says_while_idle_opens_a_valve(board):
+    board.beat(1100)
+    for seq in range(256):
+        board.set(*FULL, seq=seq, session=seq)
+        board.wait(1)
+        assert board.counts == [0] * 12
+
+
+def test_board_never_waits_for_a_host_that_does_not_read(board):
+    board.start(800)
+    for _ in range(100):
+        board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH), 0, board.session))
+        board.feed(protocol.encode(protocol.Heartbeat(board.tick + 1), 0, board.session))
+        board.tick += 1
+        board.wait(100)
+        board.follow()
+    assert board.state == State.RUNNING
+    board.parser = protocol.Parser()
+    assert board.messages()  # whole frames only, none cut in two
