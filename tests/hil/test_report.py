@@ -1,0 +1,97 @@
+"""The report: what is written can be read again, says what was judged, and shows what it says it shows."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from modsoft.hil import report
+from modsoft.hil.judge import Record, Valves, judge
+from modsoft.runtime import robot as robots
+from modsoft.runtime.configuration import from_angles_deg
+
+
+@pytest.fixture
+def record():
+    ticks, slices = 100, 2000
+    angles = np.linspace(0, 20, ticks)[:, None] * np.array([0.1, -1.0])
+    mono = np.arange(ticks) * 400_000_000
+    return Record(
+        robot=robots.load("pneumatic-2"),
+        task="down",
+        steps=ticks,
+        runtime_exit=0,
+        runtime_said="",
+        tick=np.arange(ticks),
+        mono_ns=mono,
+        lateness_ms=np.linspace(0.1, 1.0, ticks),
+        missed=0,
+        held=0,
+        desired=from_angles_deg(angles),
+        configuration=from_angles_deg(angles + np.array([0.5, -2.0])),
+        frame_mono_ns=mono,
+        commanded_bar=np.zeros((ticks, 12)),
+        acknowledged_ms=np.full(ticks, 7.0),
+        faults=np.zeros(ticks, dtype=np.int64),
+        state=["RUNNING"] * ticks,
+        end_ns=ticks * 400_000_000,
+        valves=Valves(np.array([0]), np.zeros((1, 12)), 4096),
+        board_events=[],
+        board_summary={"rx_dropped": 0, "late_max_ms": 0.4},
+        plant_mono_ns=np.arange(slices) * 20_000_000,
+        plant_configuration=np.repeat(from_angles_deg(angles + np.array([0.5, -2.0])), 20, axis=0),
+        plant_bar=np.zeros((slices, 2, 2)),
+        plant_late_ms=np.zeros(slices),
+    )
+
+
+def test_figures_are_of_the_run(record):
+    found = report.figures(record)
+    assert found["tracking_error_deg"]["mean"] == pytest.approx([0.5, 2.0])
+    assert found["tracking_error_percent"]["mean"] == pytest.approx([0.8727, 3.4905], abs=1e-3)  # 2 sin(half angle)
+    assert found["lateness_ms"] == pytest.approx({"p50": 0.55, "p99": 1.0, "max": 1.0}, abs=0.02)
+    assert found["ticks"] == 100
+
+
+def test_the_folder_holds_text_figures_and_picture(record, tmp_path):
+    report.write(record, judge(record), {"board": "simavr", "firmware": "abc"}, tmp_path)
+    document = json.loads((tmp_path / "report.json").read_text())
+    assert document["verdict"] == "passed"
+    assert document["about"] == {"board": "simavr", "firmware": "abc"}
+    assert document["figures"]["tracking_error_deg"]["mean"] == pytest.approx([0.5, 2.0])
+    text = (tmp_path / "report.md").read_text()
+    assert text.startswith("# pneumatic-2, task down: passed")
+    assert "- board: simavr" in text
+    assert "0.50 ± 0.00" in text
+    assert (tmp_path / "angles.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_run_that_failed_before_its_first_tick_has_a_report_too(record, tmp_path):
+    empty = {
+        name: getattr(record, name)[:0]
+        for name in "tick mono_ns lateness_ms desired configuration frame_mono_ns commanded_bar acknowledged_ms".split()
+    }
+    failed = replace(record, **empty, faults=record.faults[:0], state=[], runtime_exit=65, runtime_said="model damaged")
+    report.write(failed, judge(failed), {}, tmp_path)
+    assert "model damaged" in (tmp_path / "report.md").read_text()
+    assert "NaN" not in (tmp_path / "report.json").read_text()
+    assert not (tmp_path / "angles.png").exists()
+
+
+def test_what_a_slow_host_voids_is_marked(record):
+    slow = replace(record, board_summary={"rx_dropped": 0, "late_max_ms": 300.0})
+    text = report.text(slow, judge(slow), {}, report.figures(slow))
+    assert "not judged: the host was too slow" in text
+    assert "| lateness of a tick, 99th percentile | 1.00 ms | < 20 ms | void |" in text
+
+
+def test_the_picture_names_its_units(record):
+    figure = report.picture(record)
+    labels = [axes.get_ylabel() + axes.get_xlabel() for axes in figure.axes]
+    assert any("°" in label for label in labels)
+    assert any("bar" in label for label in labels)
+    assert any("time, s" in label for label in labels)
+    lines = figure.axes[1].get_lines()
+    np.testing.assert_allclose(lines[2].get_ydata()[-1], -20.0)  # desired of module 2
+    np.testing.assert_allclose(lines[1].get_ydata()[-1], -22.0)  # measured
