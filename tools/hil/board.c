@@ -1,0 +1,215 @@
+/* The emulated MEGA: the compiled firmware on simavr's ATmega2560, behind the board's real bootloader.
+ *
+ * board --elf FIRMWARE [--bootloader HEX] --port-link PATH [--fast]
+ *
+ * PATH becomes a symbolic link to the board's serial port. Opening it resets the board, as DTR does on the real one.
+ * Emulated time is held to real time (never ahead, at most 20 ms behind, else it gives way and says so) unless --fast.
+ *
+ * Commands, one a line on standard input; end of file ends the board:
+ *   adc INPUT MILLIVOLT                       voltage on A0..A7
+ *   sensors TAU_MS                            every pressure sensor follows its valve with a first-order lag, until `adc`
+ *   reset | power-cycle                       reset pin; power off and on (RAM lost)
+ *   hang                                      the main loop stops where it is, interrupts still run, until a reset
+ *   unplug | plug [PATH]                      pull the USB cable (the board keeps its power); back in, under a new name
+ *   corrupt-rx|drop-rx|insert-rx P [SEED]     line noise towards the board, probability a byte
+ *   corrupt-tx|drop-tx P [SEED]               line noise towards the host
+ *   flood MS | seed N                         random bytes at line rate towards the board; seed of the noise
+ *   stats | quit
+ *
+ * Events, one JSON object a line on standard output, each with t_us (emulated, from the cycle counter), mono_ns
+ * (CLOCK_MONOTONIC when it was emulated) and event:
+ *   ready      board, clock, port, channels, bootloader, pid; p_full_bar (valve pressure at duty 1), sensors (bit c: channel
+ *              c is sensed on input c), sensor_mv_per_bar
+ *   pwm        channel (order of firmware/pins.h), duty 0..1, raw [compare, top]; only when one of them changes
+ *   uart-open, uart-close, dtr-pulse, wrong-baud
+ *   watchdog, reset (cause: power-on, external, watchdog), hang, halted
+ *   late       emulated time gave way by late_us
+ *   command    line, done: the echo of every command but `adc`
+ *   stats, summary   times, lateness, share of a core, byte counters
+ *
+ * Known differences from the chip: a new compare value shows at once, not at the end of the PWM period (256 us); a pin
+ * whose timer is connected but stopped counts as 0; ADC8..15 are not there; sleep takes no time to wake from.
+ *
+ * simavr is GPL-3: this file is a test tool and not part of the wheel. */
+#include "mega.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <strings.h>
+
+#include "avr_adc.h"
+#include "avr_extint.h"
+#include "sim_elf.h"
+#include "sim_hex.h"
+
+#define RJMP_SELF 0xCFFF /* rjmp .-2 */
+
+const char *const board_name = "simavr";
+
+avr_t *avr;
+
+static void (*chip_reset)(avr_t *);
+static const char *reset_cause = "watchdog"; /* unless somebody outside the chip set it */
+static bool was_reset, halted_reported;
+static struct { uint32_t at; uint8_t before[2]; bool on; } hang;
+
+/* --- reset and power --------------------------------------------------------------------------------------------- */
+
+static void on_chip_reset(avr_t *chip)
+{
+    was_reset = true;
+    if (chip_reset)
+        chip_reset(chip);
+}
+
+static void after_reset(void)
+{
+    was_reset = halted_reported = false;
+    if (hang.on) {
+        memcpy(avr->flash + hang.at, hang.before, 2);
+        hang.on = false;
+    }
+    for (int i = 0; i < EXTINT_COUNT; i++)
+        avr_extint_set_strict_lvl_trig(avr, i, 0); /* else the low pins are polled in every cycle: 0.35x real time */
+    avr->run_cycle_limit = TICKS_PER_SECOND / 1000; /* run on until the next timer instead of one instruction a call */
+    uart_after_reset();
+    if (!strcmp(reset_cause, "external"))
+        avr->data[MCUSR] |= 1 << EXTRF;
+    else if (!strcmp(reset_cause, "power-on"))
+        avr->data[MCUSR] |= 1 << PORF;
+    report_reset(reset_cause);
+    reset_cause = "watchdog";
+    outputs_sample();
+}
+
+void board_reset_pin(void)
+{
+    reset_cause = "external";
+    avr_reset(avr);
+    after_reset();
+}
+
+/* Static RAM and the working registers hold chance values at power-on; every other reset leaves them alone. */
+static void forget_ram(void)
+{
+    for (unsigned address = 0; address <= avr->ramend; address++)
+        if (address < 32 || address > avr->ioend)
+            avr->data[address] = random_u32();
+}
+
+void board_power_cycle(void)
+{
+    reset_cause = "power-on";
+    avr_reset(avr);
+    forget_ram();
+    after_reset();
+}
+
+bool board_hang(void)
+{
+    if (hang.on || (avr->reset_pc && avr->pc >= avr->reset_pc))
+        return false; /* the bootloader has no watchdog */
+    hang.at = avr->pc;
+    hang.on = true;
+    memcpy(hang.before, avr->flash + hang.at, 2);
+    avr->flash[hang.at] = RJMP_SELF & 0xFF;
+    avr->flash[hang.at + 1] = RJMP_SELF >> 8;
+    event("hang", "\"pc\":%u", (unsigned)avr->pc);
+    return true;
+}
+
+static avr_cycle_count_t on_slice_end(avr_t *chip, avr_cycle_count_t when, void *param)
+{
+    (void)chip, (void)when, (void)param;
+    return 0; /* it is only there so that a sleeping chip does not sleep past it */
+}
+
+void board_run(ticks_t until)
+{
+    uart_start_byte();
+    avr_cycle_timer_register(avr, until - avr->cycle, on_slice_end, NULL);
+    while (avr->cycle < until) {
+        avr->run(avr);
+        if (was_reset) { /* by the watchdog */
+            after_reset();
+            avr_cycle_timer_register(avr, until > avr->cycle ? until - avr->cycle : 1, on_slice_end, NULL);
+        }
+        if (avr->state == cpu_Done || avr->state == cpu_Crashed) { /* asleep with interrupts off, or lost: time goes on */
+            if (!halted_reported)
+                event("halted", "\"pc\":%u,\"crashed\":%s", (unsigned)avr->pc, avr->state == cpu_Crashed ? "true" : "false");
+            halted_reported = true;
+            avr->cycle += TICKS_PER_US;
+        }
+    }
+}
+
+ticks_t board_now(void)
+{
+    return avr ? avr->cycle : 0;
+}
+
+void board_set_adc(unsigned input, unsigned millivolt)
+{
+    avr_raise_irq(avr_io_getirq(avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_ADC0 + input), millivolt);
+}
+
+/* --- start ------------------------------------------------------------------------------------------------------- */
+
+static uint32_t load_hex(const char *path)
+{
+    ihex_chunk_p chunks = NULL;
+    int count = read_ihex_chunks(path, &chunks);
+    if (count <= 0)
+        fail(EXIT_USAGE, "%s is not an Intel hex file that can be read", path);
+    for (int i = 0; i < count; i++)
+        avr_loadcode(avr, chunks[i].data, chunks[i].size, chunks[i].baseaddr);
+    return chunks[0].baseaddr;
+}
+
+static void load_firmware(const char *path)
+{
+    const char *suffix = strrchr(path, '.');
+    elf_firmware_t firmware = {0};
+    if (suffix && !strcasecmp(suffix, ".hex"))
+        load_hex(path);
+    else if (elf_read_firmware(path, &firmware) != 0 || !firmware.flashsize)
+        fail(EXIT_USAGE, "%s is not a firmware ELF file that can be read", path);
+    else
+        avr_loadcode(avr, firmware.flash, firmware.flashsize, firmware.flashbase);
+}
+
+static void log_to_stderr(avr_t *chip, const int level, const char *format, va_list arguments)
+{
+    (void)chip;
+    if (level <= LOG_ERROR)
+        vfprintf(stderr, format, arguments);
+}
+
+static void do_not_sleep(avr_t *chip, avr_cycle_count_t cycles)
+{
+    (void)chip, (void)cycles; /* the harness holds the pace, slice by slice */
+}
+
+void board_power_on(const struct options *options)
+{
+    if (!options->firmware)
+        fail(EXIT_USAGE, "--elf FILE is missing: the firmware to run");
+    avr_global_logger_set(log_to_stderr);
+    avr = avr_make_mcu_by_name("atmega2560");
+    if (!avr)
+        fail(EXIT_INTERNAL, "this simavr has no ATmega2560");
+    avr_init(avr);
+    avr->frequency = TICKS_PER_SECOND;
+    avr->vcc = avr->avcc = avr->aref = 5000;
+    avr->sleep = do_not_sleep;
+    chip_reset = avr->reset;
+    avr->reset = on_chip_reset;
+    load_firmware(options->firmware);
+    if (options->bootloader)
+        avr->reset_pc = load_hex(options->bootloader);
+
+    uart_begin();
+    outputs_begin();
+    board_power_cycle();
+}

@@ -1,0 +1,75 @@
+/* What the two emulated boards share, and what each of them has to give.
+ *
+ * board.c (the compiled firmware on simavr) and native_board.c (the firmware's logic compiled for this machine) implement
+ * the board_* functions; line.c (the serial line as a pseudo terminal) and harness.c (main, commands, events, pacing)
+ * are the same for both. The commands and events are described at the top of board.c. */
+#ifndef HARNESS_H
+#define HARNESS_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+/* Emulated time is counted in ticks: CPU cycles at 16 MHz, on both boards. */
+#define TICKS_PER_US 16
+#define TICKS_PER_SECOND (1000000u * TICKS_PER_US)
+typedef uint64_t ticks_t;
+
+#define ADC_CHANNELS 8
+#define MAX_CHANNELS 16
+
+struct options {
+    const char *firmware;   /* ELF or Intel hex; the native board has its own compiled in */
+    const char *bootloader; /* Intel hex, or NULL: the reset vector is then the firmware's */
+    const char *port_link;  /* symbolic link to be made to the serial port */
+    bool fast;              /* do not hold emulated time to real time */
+};
+
+/* --- a board ----------------------------------------------------------------------------------------------------- */
+
+extern const char *const board_name;
+extern const unsigned board_channels;
+
+void board_power_on(const struct options *options);
+ticks_t board_now(void);
+void board_run(ticks_t until); /* may overshoot by one instruction */
+void board_reset_pin(void);    /* what DTR does when the port is opened */
+void board_power_cycle(void);  /* a reset that also loses the RAM */
+bool board_hang(void);         /* no progress in the main loop until the next reset; false: not possible now */
+void board_set_adc(unsigned input, unsigned millivolt);
+
+/* --- the serial line (line.c) ------------------------------------------------------------------------------------ */
+
+struct line_counters {
+    uint64_t rx, tx;                   /* bytes that the board received, sent */
+    uint64_t rx_corrupted, rx_dropped; /* by the injected noise */
+    uint64_t tx_corrupted, tx_dropped;
+    uint64_t rx_overrun;               /* lost in the UART: the firmware was too slow */
+    uint64_t tx_unread;                /* lost because the host did not read */
+    uint64_t wrong_baud;               /* garbled: host and board set different rates */
+};
+extern struct line_counters line_counters;
+
+void line_open(const char *link);
+void line_unplug(void);
+void line_plug(const char *link);
+const char *line_port(void);
+void line_poll(void);                             /* once a slice: opened or closed, bytes in */
+void line_flush(ticks_t now);                     /* once a slice: bytes out whose stop bit has passed */
+int line_next_byte(uint32_t board_baud);          /* the byte that starts to arrive now, or -1 */
+ticks_t line_byte_ticks(void);                    /* how long it takes to arrive, at the host's rate */
+void line_send(ticks_t end, uint8_t byte, uint32_t board_baud);
+bool line_command(const char *verb, double probability);
+void line_flood(ticks_t duration);
+
+/* --- events and random numbers (harness.c) ----------------------------------------------------------------------- */
+
+void event(const char *name, const char *format, ...) __attribute__((format(printf, 2, 3)));
+void report_duty(unsigned channel, double duty, unsigned compare, unsigned top);
+void report_reset(const char *cause);
+uint32_t random_u32(void);
+_Noreturn void fail(int exit_code, const char *format, ...) __attribute__((format(printf, 2, 3)));
+
+enum { EXIT_USAGE = 2, EXIT_INTERNAL = 70 };
+
+#endif
