@@ -1,0 +1,203 @@
+"""The fake tracker: its protocol without a line, and what the faults do."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from modsoft.hil.polaris import write_tool_files
+from modsoft.hil.polaris_device import Polaris, crc16, quaternion
+
+
+def framed(command: str) -> bytes:
+    return f"{command}{crc16(command.encode()):04X}".encode()
+
+
+class Device(Polaris):
+    """On a clock that the test moves."""
+
+    def __init__(self, **options):
+        self.time_s = 100.0
+        super().__init__(lambda: self.time_s, **options)
+
+    def ask(self, command: str) -> str:
+        """The text of an answer, its checksum proven."""
+        answer = self.answer(framed(command)).decode()
+        assert answer.endswith("\r")
+        assert answer[-5:-1] == f"{crc16(answer[:-5].encode()):04X}"
+        return answer[:-5]
+
+    def set_up(self, tools: int, start: bool = True) -> "Device":
+        assert self.ask("INIT:") == "OKAY"
+        for _ in range(tools):
+            handle = self.ask("PHRQ:*********1****")
+            assert self.ask(f"PVWR:{handle}0000" + "00" * 64) == "OKAY"
+            assert self.ask(f"PINIT:{handle}") == "OKAY"
+            assert self.ask(f"PENA:{handle}D") == "OKAY"
+        if start:
+            assert self.ask("TSTART:") == "OKAY"
+        return self
+
+    def tools(self) -> list[tuple[str, str, int]]:
+        """(handle, transform or MISSING, frame number) of each tool in a TX answer."""
+        text = self.ask("TX:0801")
+        rows = text[2:].split("\n")[:-1]
+        assert len(rows) == int(text[:2], 16)
+        return [(row[:2], row[2:-16], int(row[-8:], 16)) for row in rows]
+
+
+def poses(count: int) -> list:
+    stack = np.tile(np.eye(4), (count, 1, 1))
+    stack[:, 2, 3] = -1000.0 - 50.0 * np.arange(count)
+    return stack.tolist()
+
+
+def test_checksum_as_the_client_sends_it():
+    # The bytes that ndicapi has built in for its probe.
+    assert framed("INIT:") == b"INIT:E3A5"
+    assert Device().answer(b"INIT:E3A5") == b"OKAYA896\r"
+    assert framed("GETINFO:Features.Firmware.Version") == b"GETINFO:Features.Firmware.Version0492"
+
+
+def test_wrong_checksum_is_refused():
+    assert Device().answer(b"INIT:0000").startswith(b"ERROR04")
+
+
+@pytest.mark.parametrize("command", ["TX:0801", "TX 0801", "BX:0801"])
+def test_no_frames_before_the_start(command):
+    device = Device().set_up(2, start=False)
+    answer = device.answer(framed(command) if ":" in command else command.encode())
+    assert answer.startswith(b"ERROR0C")
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [("PINIT:0A", "08"), ("PENA:0AD", "08"), ("TX:FFFF", "01"), ("PHSR:77", "01"), ("NONSENSE:", "01")],
+)
+def test_wrong_calls_are_refused(command, code):
+    assert Device().set_up(0, start=command.startswith("TX")).ask(command) == f"ERROR{code}"
+
+
+def test_nothing_before_init():
+    assert Device().ask("PHRQ:*********1****") == "ERROR10"
+
+
+def test_order_of_set_up_is_enforced():
+    device = Device().set_up(0, start=False)
+    handle = device.ask("PHRQ:*********1****")
+    assert device.ask(f"PINIT:{handle}") == "ERROR0D"  # no tool definition yet
+    device.ask(f"PVWR:{handle}0000" + "00" * 64)
+    assert device.ask(f"PENA:{handle}D") == "ERROR0E"
+    assert device.ask("PHSR:02") == f"01{handle}001"
+    device.ask(f"PINIT:{handle}")
+    assert device.ask("PHSR:03") == f"01{handle}001"
+    device.ask("TSTART:")
+    assert device.tools() == []  # initialised, but not enabled
+    assert device.ask(f"PENA:{handle}D") == "ERROR0C"  # not while it tracks
+
+
+def test_transforms_are_rounded_as_on_the_device():
+    device = Device().set_up(1)
+    pose = np.eye(4)
+    pose[:3, 3] = [1.234, -5.678, -1400.129]
+    device.take({"poses": [pose.tolist()]})
+    [(_, transform, _)] = device.tools()
+    assert transform == "+10000+00000+00000+00000" + "+000123-000568-140013" + "+01000"
+
+
+def test_binary_answer():
+    device = Device().set_up(2)
+    device.take({"poses": poses(2), "hide": [1]})
+    answer = device.answer(framed("BX:0801"))
+    start, length, header_crc = struct.unpack("<HHH", answer[:6])
+    body = answer[6:-2]
+    assert (start, length, header_crc) == (0xA5C4, len(body), crc16(answer[:4]))
+    assert struct.unpack("<H", answer[-2:])[0] == crc16(body) == crc16(answer[:-2])
+    assert body[:3] == bytes([2, 0x0A, 1])
+    assert struct.unpack("<8f", body[3:35])[:7] == (1, 0, 0, 0, 0, 0, -1000)
+    assert body[43:45] == bytes([0x0B, 2])  # missing: no transform
+    assert len(body) == 1 + 42 + 10 + 2
+
+
+def test_frame_numbers_run_at_60_hz_without_new_poses():
+    device = Device().set_up(1)
+    device.take({"poses": poses(1)})
+    before = device.tools()[0][2]
+    device.time_s += 10.0
+    assert device.tools()[0][2] == before + 600
+
+
+def test_faults():
+    device = Device().set_up(3)
+    device.take({"poses": poses(3)})
+    whole = device.tools()
+    device.take({"hide": [1]})
+    assert [transform == "MISSING" for _, transform, _ in device.tools()] == [False, True, False]
+    device.take({"hide": [], "lose": [2]})
+    assert [handle for handle, *_ in device.tools()] == ["0A", "0B"]
+    device.take({"lose": [], "swap": [0, 2]})
+    assert [t for _, t, _ in device.tools()] == [whole[2][1], whole[1][1], whole[0][1]]
+    device.take({"swap": None, "jump": {"tool": 1, "mm": [10.0, 0, 0], "deg": 90.0}})
+    assert device.tools()[1][1].startswith("+07071+07071+00000+00000+001000")
+    device.take({"jump": None, "back": 5})
+    device.time_s += 1.0
+    assert device.tools()[0][2] == whole[0][2] + 55
+    device.take({"back": 0})
+    assert device.answer(framed("TX:0801")) == (device.take({"corrupt": False}) or device.answer(framed("TX:0801")))
+    device.take({"corrupt": True})
+    spoilt = device.answer(framed("TX:0801"))
+    assert spoilt[-5:-1] != f"{crc16(spoilt[:-5]):04X}".encode()
+    device.take({"mute": True})
+    assert device.answer(framed("TX:0801")) == b""
+
+
+def test_frozen_and_delayed():
+    device = Device().set_up(1)
+    for step in range(50):
+        pose = np.eye(4)
+        pose[2, 3] = -step
+        device.take({"poses": [pose.tolist()]})
+        device.time_s += 0.02
+    device.take({"delay_s": 0.49})
+    _, transform, number = device.tools()[0]
+    assert (transform[38:45], number) == ("-002500", 30)
+    device.take({"delay_s": 0.0, "freeze": True})
+    frozen = device.tools()
+    device.time_s += 1.0
+    device.take({"poses": poses(1)})
+    assert device.tools() == frozen
+    device.take({"freeze": False})
+    assert device.tools() != frozen
+
+
+def test_an_unknown_fault_is_an_error():
+    with pytest.raises(ValueError, match="explode"):
+        Device().take({"explode": True})
+
+
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4))
+def test_quaternion_gives_the_rotation_back(values):
+    q = np.array(values)
+    if np.linalg.norm(q) < 1e-3:
+        q = np.array([0.0, 0.0, 0.0, 1.0])
+    w, x, y, z = q / np.linalg.norm(q)
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    found = np.array(quaternion(pose.tolist()))
+    assert found[0] >= 0
+    assert abs(found @ [w, x, y, z]) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_tool_files_are_told_apart(tmp_path):
+    paths = write_tool_files(tmp_path, 3)
+    assert [path.name for path in paths] == ["base.rom", "module-1.rom", "module-2.rom"]
+    assert len({path.read_bytes() for path in paths}) == 3

@@ -1,0 +1,140 @@
+"""A fake Polaris: an optical tracker of passive tools on a pseudo-terminal, in a process of its own.
+
+`python -m modsoft.hil.polaris --link PATH` makes PATH a serial port that speaks the device's ASCII protocol (and its
+binary `BX` answer) well enough for the unmodified scikit-surgerynditracker. A process of its own, because that client
+holds its interpreter while it looks for a device. Standard input, one JSON object a line, any keys together; its end
+ends the process:
+
+    {"poses": [[4 x 4], ...]}  poses of the tools, base first, mm, in the tracker's frame; the newest is shown
+    {"hide": [k, ...]}         tools that are missing from now on (0 is the base); [] shows all again
+    {"lose": [k, ...]}         tools that are left out of the answer altogether
+    {"freeze": true}           the same frame, number included, again and again
+    {"delay_s": s}             frames and their numbers are this old
+    {"back": n}                frame numbers n smaller
+    {"jump": {"tool": k, "mm": [x, y, z], "deg": d}}   tool k is seen there, turned about its own x axis; null ends it
+    {"swap": [j, k]}           two tools are taken for each other; null ends it
+    {"corrupt": true}          a wrong checksum on every answer to TX and BX
+    {"mute": true}             no answer to anything
+    {"unplug": true}           the port goes away; false brings it back
+
+Standard output, one JSON line each: {"event": "ready", "port": PATH}, {"event": "tracking", "mono_ns"} at every TSTART,
+{"event": "summary", "commands": {name: count}, "frames"} at the end.
+
+Answers take their time on a line of 115200 baud.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import sys
+import time
+import tty
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from modsoft.hil.polaris_device import Polaris
+from modsoft.runtime.command import entry
+
+SECONDS_A_BYTE = 10 / 115200
+
+
+class Line:
+    """A pseudo-terminal under a name of its own. Its other end is kept open here, so that a client may come and go."""
+
+    def __init__(self, link: Path):
+        self.link = link
+        self.plug()
+
+    def plug(self) -> None:
+        self.master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self.master, False)
+        made = self.link.with_name(self.link.name + ".new")
+        made.unlink(missing_ok=True)
+        made.symlink_to(os.ttyname(self._slave))
+        made.replace(self.link)
+        self._pending = b""
+
+    def unplug(self) -> None:
+        self.link.unlink(missing_ok=True)
+        if self.master >= 0:
+            os.close(self.master)
+            os.close(self._slave)
+            self.master = -1
+
+    def commands(self) -> list[bytes]:
+        """Whole commands that have come in."""
+        *whole, self._pending = (self._pending + os.read(self.master, 4096)).split(b"\r")
+        return whole
+
+    def write(self, answer: bytes) -> None:
+        """Sends an answer in the time that a line of 115200 baud needs for it."""
+        time.sleep(len(answer) * SECONDS_A_BYTE)
+        try:
+            os.write(self.master, answer)
+        except BlockingIOError:
+            pass  # nobody reads, as on a real line
+
+
+def serve(device: Polaris, line: Line, say: Callable[[dict[str, Any]], None], stdin: int) -> None:
+    """Until the standard input ends."""
+    pending = b""
+    while True:
+        ready = select.select([stdin, *([line.master] if line.master >= 0 else [])], [], [])[0]
+        if stdin in ready:
+            chunk = os.read(stdin, 65536)
+            if not chunk:
+                return
+            *lines, pending = (pending + chunk).split(b"\n")
+            for text in filter(None, lines):
+                device.take(json.loads(text))
+            if device.faults.get("unplug") and line.master >= 0:
+                line.unplug()
+            elif not device.faults.get("unplug") and line.master < 0:
+                line.plug()
+        if line.master >= 0 and line.master in ready:
+            for command in line.commands():
+                tracked = device.tracking
+                line.write(device.answer(command))
+                if device.tracking and not tracked:
+                    say({"event": "tracking", "mono_ns": time.monotonic_ns()})
+
+
+def write_tool_files(folder: Path, tools: int) -> list[Path]:
+    """Tool definition files for this many tools, base first. The fake takes any content; the client sends them as they
+    are, and a real device would refuse these."""
+    paths = [folder / ("base.rom" if tool == 0 else f"module-{tool}.rom") for tool in range(tools)]
+    for path in paths:
+        path.write_bytes(b"NDI\0" + path.stem.encode().ljust(748, b"\0"))
+    return paths
+
+
+@click.command("modsoft-hil-polaris")
+@click.option("--link", required=True, type=click.Path(path_type=Path), help="Name that the serial port gets.")
+@click.option("--firmware", default="Polaris Spectra Rev 009", show_default=True,
+              help='Its version; one that ends in "Rev 007" makes the client ask for TX in place of BX.')  # fmt: skip
+def cli(link: Path, firmware: str) -> None:
+    """A fake optical tracker (started by modsoft-hil)."""
+
+    def say(event: dict[str, Any]) -> None:
+        sys.stdout.write(json.dumps(event) + "\n")
+        sys.stdout.flush()
+
+    device, line = Polaris(firmware=firmware), Line(link)
+    try:
+        say({"event": "ready", "port": str(link)})
+        serve(device, line, say, sys.stdin.fileno())
+    finally:
+        line.unplug()
+    say({"event": "summary", "commands": dict(device.commands), "frames": device.frames})
+
+
+main = entry(cli)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,252 @@
+"""The fake Polaris without its line: commands in, answers out, on an injected clock. `modsoft.hil.polaris` documents
+the faults and puts it behind a serial port.
+
+Resolution is the device's own: TX gives positions in 0.01 mm and quaternions in 1e-4, BX single floats. Frame numbers
+run at 60 Hz whatever the poses do. It is as strict as the device where a wrong order of calls would go unnoticed
+otherwise: only enabled tools are reported, and none before TSTART.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+FRAME_HZ = 60.0
+FIRST_HANDLE = 0x0A  # as the wireless tools of the device: a handle is no index
+BX_START = 0xA5C4
+# Answer status, and error codes of the protocol.
+VALID, MISSING = 0x01, 0x02
+BAD_COMMAND, BAD_CRC, BAD_HANDLE, WRONG_MODE = 0x01, 0x04, 0x08, 0x0C
+NO_TOOL, NOT_INITIALISED, NO_SYSTEM = 0x0D, 0x0E, 0x10
+PORT_OK, PORT_MISSING = 0x31, 0x131  # occupied, initialised, enabled; out of volume too
+# What PHSR lists, by its option: all, to be freed, to be initialised, to be enabled, enabled.
+LISTED = {
+    "00": ("requested", "written", "initialised", "enabled"),
+    "01": (),
+    "02": ("requested", "written"),
+    "03": ("initialised",),
+    "04": ("enabled",),
+}
+FAULTS = ("hide", "lose", "freeze", "delay_s", "back", "jump", "swap", "corrupt", "mute", "unplug")
+SAMPLES = 256  # poses kept for a delayed device: five seconds at the rig's 50 Hz
+
+Pose = list[list[float]]
+
+
+def crc16(data: bytes) -> int:
+    """The protocol's checksum: CRC-16 with polynomial 0xA001, reflected, from 0."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ 0xA001 if crc & 1 else crc >> 1
+    return crc
+
+
+def quaternion(pose: Pose) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z), w >= 0, of a pose's rotation: the largest component first, so that none is lost."""
+    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in pose[:3])
+    squares = [1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i]  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
+    largest = max(range(4), key=squares.__getitem__)
+    products = [
+        (squares[0], h - f, c - g, d - b),
+        (h - f, squares[1], b + d, c + g),
+        (c - g, b + d, squares[2], f + h),
+        (d - b, c + g, f + h, squares[3]),
+    ][largest]
+    scale = math.sqrt(sum(value * value for value in products)) * (1 if products[0] >= 0 else -1)
+    w, x, y, z = (value / scale for value in products)
+    return w, x, y, z
+
+
+def turned(pose: Pose, mm: list[float], deg: float) -> Pose:
+    """A pose moved by `mm` in the tracker's frame and turned about its own x axis."""
+    cos, sin = math.cos(math.radians(deg)), math.sin(math.radians(deg))
+    rows = [
+        [row[0], row[1] * cos + row[2] * sin, row[2] * cos - row[1] * sin, row[3] + mm[axis]]
+        for axis, row in enumerate(pose[:3])
+    ]
+    return [*rows, [0.0, 0.0, 0.0, 1.0]]
+
+
+class Refused(Exception):
+    """The device answers ERROR with this code."""
+
+    def __init__(self, code: int):
+        super().__init__(f"ERROR{code:02X}")
+        self.code = code
+
+
+class Polaris:
+    """The device without its line: commands in, answers out. `now` is a monotonic clock in seconds."""
+
+    def __init__(self, now: Callable[[], float] = time.monotonic, firmware: str = "Polaris Spectra Rev 009"):
+        """`firmware`: with "Rev 007" at its end the client asks for TX in place of BX."""
+        self.now = now
+        self.firmware = firmware
+        self.faults: dict[str, Any] = {}
+        self.commands: Counter[str] = Counter()
+        self.frames = 0
+        self.tracking = False
+        self._started_s = now()
+        self._samples: deque[tuple[float, list[Pose]]] = deque(maxlen=SAMPLES)
+        self._frozen: tuple[int, list[Pose]] | None = None
+        self._initialised = False
+        self._tools: dict[int, str] = {}  # handle: requested, written, initialised, enabled
+
+    def take(self, line: dict[str, Any]) -> None:
+        """One line of the standard input: new poses, faults on or off."""
+        line = dict(line)
+        if "poses" in line:
+            self._samples.append((self.now(), line.pop("poses")))
+        for name, value in line.items():
+            if name not in FAULTS:
+                raise ValueError(f"no fault is called {name!r}; known: {', '.join(FAULTS)}")
+            self.faults[name] = value
+        if not self.faults.get("freeze"):
+            self._frozen = None
+        elif self._frozen is None:
+            self._frozen = self._frame()
+
+    def answer(self, command: bytes) -> bytes:
+        """The answer to one command, without its carriage return; empty from a mute device."""
+        name, colon, parameters = command.decode("ascii", "replace").partition(":")
+        if not colon:
+            name, _, parameters = command.decode("ascii", "replace").partition(" ")
+        self.commands[name] += 1
+        if self.faults.get("mute"):
+            return b""
+        try:
+            if colon:
+                parameters, crc = parameters[:-4], parameters[-4:]
+                if crc != f"{crc16(command[:-4]):04X}":
+                    raise Refused(BAD_CRC)
+            if name == "BX":
+                return self._bx(self._asked(parameters))
+            text = self._ascii(name, parameters)
+        except Refused as refused:
+            text = str(refused)
+        return self._sealed(text, spoilt=name == "TX")
+
+    def _sealed(self, text: str, spoilt: bool = False) -> bytes:
+        crc = crc16(text.encode()) ^ (0x5A5A if spoilt and self.faults.get("corrupt") else 0)
+        return f"{text}{crc:04X}\r".encode()
+
+    def _ascii(self, name: str, parameters: str) -> str:
+        if name == "INIT":
+            self._initialised, self.tracking = True, False
+            return "OKAY"
+        if name == "GETINFO":
+            return f"{parameters}=009.000;1;0;1;;;{parameters}"
+        if name == "VER":
+            return f"Polaris Spectra Control Firmware\nNDI S/N: P7-00000\nFreeze Tag: {self.firmware}\n(C) emulated\n"
+        if not self._initialised:
+            raise Refused(NO_SYSTEM)
+        if name == "TX":
+            return self._tx(self._asked(parameters))
+        if name == "TSTOP":
+            self.tracking = False
+            return "OKAY"
+        if self.tracking:
+            raise Refused(WRONG_MODE)
+        return self._setup(name, parameters)
+
+    def _setup(self, name: str, parameters: str) -> str:
+        """The commands that are allowed only while the device does not track."""
+        match name:
+            case "COMM":
+                return "OKAY"
+            case "TSTART":
+                self.tracking = True
+                return "OKAY"
+            case "PHRQ":
+                handle = FIRST_HANDLE + len(self._tools)
+                self._tools[handle] = "requested"
+                return f"{handle:02X}"
+            case "PHSR":
+                if parameters not in LISTED:
+                    raise Refused(BAD_COMMAND)
+                found = [handle for handle, state in self._tools.items() if state in LISTED[parameters]]
+                return f"{len(found):02X}" + "".join(f"{handle:02X}001" for handle in found)
+        handle = int(parameters[:2], 16) if name in ("PHF", "PVWR", "PINIT", "PENA") else -1
+        if handle < 0:
+            raise Refused(BAD_COMMAND)
+        if handle not in self._tools:
+            raise Refused(BAD_HANDLE)
+        before = self._tools[handle]
+        if name == "PHF":
+            del self._tools[handle]
+        elif name == "PVWR":
+            self._tools[handle] = "written"
+        elif name == "PINIT":
+            if before == "requested":
+                raise Refused(NO_TOOL)
+            self._tools[handle] = "initialised"
+        else:
+            if before not in ("initialised", "enabled"):
+                raise Refused(NOT_INITIALISED)
+            self._tools[handle] = "enabled"
+        return "OKAY"
+
+    def _asked(self, parameters: str) -> list[tuple[int, Pose | None, int]]:
+        """What TX and BX report: (handle, pose or None, frame number) of every enabled tool."""
+        if parameters not in ("", "0001", "0801"):
+            raise Refused(BAD_COMMAND)
+        if not self.tracking:
+            raise Refused(WRONG_MODE)
+        number, poses = self._frozen or self._frame()
+        self.frames += 1
+        enabled = [handle for handle, state in self._tools.items() if state == "enabled"]
+        order = list(range(len(enabled)))
+        if self.faults.get("swap"):
+            j, k = self.faults["swap"]
+            order[j], order[k] = order[k], order[j]
+        rows = []
+        for tool, handle in enumerate(enabled):
+            if tool in self.faults.get("lose", ()):
+                continue
+            seen = order[tool] < len(poses) and tool not in self.faults.get("hide", ())
+            pose = poses[order[tool]] if seen else None
+            jump = self.faults.get("jump")
+            if pose is not None and jump and jump["tool"] == tool:
+                pose = turned(pose, jump.get("mm", [0.0, 0.0, 0.0]), jump.get("deg", 0.0))
+            rows.append((handle, pose, number))
+        return rows
+
+    def _frame(self) -> tuple[int, list[Pose]]:
+        """Frame number and poses at this instant, or at an earlier one for a delayed device."""
+        at_s = self.now() - self.faults.get("delay_s", 0.0)
+        poses: list[Pose] = []
+        for sampled_s, sample in reversed(self._samples):
+            poses = sample
+            if sampled_s <= at_s:
+                break
+        return max(0, int((at_s - self._started_s) * FRAME_HZ) - self.faults.get("back", 0)), poses
+
+    def _tx(self, rows: list[tuple[int, Pose | None, int]]) -> str:
+        text = f"{len(rows):02X}"
+        for handle, pose, number in rows:
+            text += f"{handle:02X}"
+            if pose is None:
+                text += f"MISSING{PORT_MISSING:08X}{number:08X}\n"
+            else:
+                text += "".join(f"{round(value * 1e4):+06d}" for value in quaternion(pose))
+                text += "".join(f"{round(pose[axis][3] * 1e2):+07d}" for axis in range(3))
+                text += f"{round(0.1 * 1e4):+06d}{PORT_OK:08X}{number:08X}\n"
+        return text + "0000"
+
+    def _bx(self, rows: list[tuple[int, Pose | None, int]]) -> bytes:
+        body = bytes([len(rows)])
+        for handle, pose, number in rows:
+            body += bytes([handle, MISSING if pose is None else VALID])
+            if pose is not None:
+                body += struct.pack("<8f", *quaternion(pose), *(pose[axis][3] for axis in range(3)), 0.1)
+            body += struct.pack("<II", PORT_MISSING if pose is None else PORT_OK, number)
+        body += struct.pack("<H", 0)
+        header = struct.pack("<HH", BX_START, len(body))
+        crc = crc16(body) ^ (0x5A5A if self.faults.get("corrupt") else 0)
+        return header + struct.pack("<H", crc16(header)) + body + struct.pack("<H", crc)
