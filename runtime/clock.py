@@ -1,0 +1,75 @@
+"""The pace of the loop: ticks at absolute deadlines of a monotonic clock. A late tick is skipped, never made up for."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+SLICE_S = 0.05  # waiting is cut into slices so that a lost device is noticed between two ticks
+
+
+class Tick(NamedTuple):
+    """A control step: slot `index`, due at `due_s`, begun at `start_s`, after `missed` skipped slots."""
+
+    index: int
+    due_s: float
+    start_s: float
+    missed: int
+
+    @property
+    def lateness_s(self) -> float:
+        return self.start_s - self.due_s
+
+
+class Ticker:
+    """Slot k is due at start + k * period, computed anew each time so that nothing adds up.
+
+    A slot may begin, and send, until half a period after it was due; later than that it is skipped. So two commands
+    are never less than half a period apart, however long the process was starved. `now` must be monotonic: a step of
+    the wall clock has no effect.
+    """
+
+    def __init__(
+        self,
+        period_s: float,
+        now: Callable[[], float] = time.monotonic,
+        wait: Callable[[float], object] = time.sleep,
+    ):
+        """`wait(seconds)` may return early, for instance because somebody wants the loop to stop."""
+        self.period_s = period_s
+        self.now = now
+        self._wait = wait
+        self._start_s = now()
+        self._index = -1
+
+    def start(self, delay_s: float = 0.0) -> None:
+        """Slot 0 is due `delay_s` from now."""
+        self._start_s = self.now() + delay_s
+        self._index = -1
+
+    def due_s(self, index: int) -> float:
+        """When a slot is due, seconds of the clock."""
+        return self._start_s + index * self.period_s
+
+    def too_late(self, index: int) -> bool:
+        """Whether this slot may no longer act. Asked again before the command is sent, for a step that took long."""
+        return self.now() - self.due_s(index) > self.period_s / 2
+
+    def next(self, idle: Callable[[], None] = lambda: None) -> Tick:
+        """Waits for the next slot. `idle` is called at least once, then every 50 ms; what it raises goes through."""
+        index = self._index + 1
+        idle()
+        while True:
+            left_s = self.due_s(index) - self.now()
+            if left_s > 0:
+                self._wait(min(left_s, SLICE_S))
+                idle()
+            elif self.too_late(index):
+                behind = (self.now() - self._start_s) / self.period_s - 0.5
+                index = max(index + 1, math.ceil(behind))
+            else:
+                break
+        missed, self._index = index - self._index - 1, index
+        return Tick(index, self.due_s(index), self.now(), missed)
