@@ -1,0 +1,258 @@
+"""The rig: emulated board, fake tracker and simulated robot around the real `modsoft-runtime`.
+
+    board (valve duties) -> plant -> poses -> tracker -> modsoft-runtime -> set-points -> board
+                                  -> chamber pressures -> the board's analogue inputs
+
+Each is a process of its own; this one only passes lines on, and keeps them: `board.jsonl` every event of the board with
+the timer registers, `plant.jsonl` where the robot really was. However the rig is left, all of them are ended; if it is
+killed they see the end of their input, and the runtime loses its board and ends by itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from modsoft.hil.emulator import EmulatedBoard
+from modsoft.hil.polaris import write_tool_files
+from modsoft.runtime import robot as robots
+from modsoft.runtime.errors import DeviceAbsent, LostInRun, RobotFileError, UsageError
+from modsoft.runtime.robot import Robot
+
+Line = dict[str, Any]
+
+START_TIMEOUT_S = 60.0  # the first start compiles the simulator
+STOP_TIMEOUT_S = 3.0
+RUNTIME_STOP_TIMEOUT_S = 5.0  # it vents and waits for the board's word
+FORWARD_PERIOD_S = 0.004  # a slewing board changes its duties every millisecond; the plant needs them every 20
+SENSED_CHANNELS = 8  # A0 to A7
+
+
+class Child:
+    """A helper process that takes JSON lines and gives JSON lines. `on_line` runs in its reading thread."""
+
+    def __init__(self, module: str, arguments: Sequence[str], on_line: Callable[[Line], None]):
+        self.name = module.rpartition(".")[2]
+        self._on_line = on_line
+        self._sending = threading.Lock()
+        self._ready = threading.Event()
+        self._ended = False
+        self._stderr = tempfile.TemporaryFile()
+        self.summary: Line = {}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._stderr,
+            start_new_session=True,  # a Ctrl-C at the terminal is for the rig, which ends its children in order
+        )
+        self._reader = threading.Thread(target=self._read, name=self.name, daemon=True)
+        self._reader.start()
+
+    def wait_ready(self, timeout_s: float = START_TIMEOUT_S) -> None:
+        """Returns when the process said `ready`; `DeviceAbsent` with its last word when it ended instead."""
+        deadline = time.monotonic() + timeout_s
+        while not self._ready.wait(0.1):
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                raise DeviceAbsent(f"the {self.name} did not start: {self.last_word()}")
+
+    def send(self, line: Line) -> None:
+        """One line to the process. One that has ended is noticed by `check`, not here."""
+        with contextlib.suppress(BrokenPipeError, ValueError), self._sending:
+            self.process.stdin.write(json.dumps(line).encode() + b"\n")
+            self.process.stdin.flush()
+
+    def check(self) -> None:
+        """`LostInRun` when the process ended by itself."""
+        if self._ended and self.process.poll() is not None:
+            raise LostInRun(f"the {self.name} ended in mid-run: {self.last_word()}")
+
+    def last_word(self) -> str:
+        self._stderr.seek(0)
+        lines = self._stderr.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else f"exit code {self.process.poll()}"
+
+    def stop(self) -> None:
+        """Ends the process: at the end of its input, or else by force."""
+        with contextlib.suppress(BrokenPipeError), self._sending:
+            self.process.stdin.close()
+        try:
+            self.process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self._reader.join()
+        self.process.stdout.close()
+        self._stderr.close()
+
+    def _read(self) -> None:
+        for text in self.process.stdout:
+            line = json.loads(text)
+            if line["event"] == "ready":
+                self._ready.set()
+            elif line["event"] == "summary":
+                self.summary = line
+            else:
+                self._on_line(line)
+        self._ended = True
+
+
+class Rig:
+    """Context manager. Inside it the board hangs on `board.port`, the tracker on `tracker_port`, and the robot hangs
+    at rest in real time; `run` starts modsoft-runtime on them."""
+
+    def __init__(self, robot_file: str | Path, folder: Path, board: str = "auto"):
+        """`robot_file`: file or shipped name; `folder`: where the traces and the runtime's words go."""
+        self.robot: Robot = robots.load(robot_file)
+        if self.robot.robot.kind != "pneumatic":
+            raise RobotFileError(f"{robot_file}: a {self.robot.robot.kind} robot has no valves to emulate")
+        self._robot_file = str(Path(robot_file).resolve() if Path(robot_file).is_file() else robot_file)
+        self.folder = folder
+        self.board = EmulatedBoard(board, on_event=self._board_event)
+        self.plant: Child | None = None
+        self.tracker: Child | None = None
+        self.runtime: subprocess.Popen[bytes] | None = None
+        self.plant_states: list[Line] = []
+        self._changed = threading.Event()
+        self._closing = threading.Event()
+        self._exits = contextlib.ExitStack()
+
+    # ---- Start and end
+
+    def __enter__(self) -> Rig:
+        with self._exits as exits:  # what has been started ends even when the rest does not start
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._ports = Path(exits.enter_context(tempfile.TemporaryDirectory(prefix="modsoft-rig-")))
+            self._board_log = exits.enter_context((self.folder / "board.jsonl").open("w", encoding="utf-8"))
+            self._plant_log = exits.enter_context((self.folder / "plant.jsonl").open("w", encoding="utf-8"))
+            self.tool_files = write_tool_files(self._ports, self.robot.modules + 1)
+            self.tracker = Child("modsoft.hil.polaris", ["--link", self.tracker_port], lambda line: None)
+            exits.callback(self.tracker.stop)
+            self.tracker.wait_ready()
+            self.plant = Child("modsoft.hil.plant", ["--robot", self._robot_file], self._plant_state)
+            exits.callback(self.plant.stop)
+            self.plant.wait_ready()
+            exits.callback(self.board.stop)
+            self.board.start()
+            forwarder = threading.Thread(target=self._forward_duties, name="duties", daemon=True)
+            forwarder.start()
+            exits.callback(forwarder.join)
+            exits.callback(self._closing.set)
+            exits.callback(self._stop_runtime)
+            self._exits = exits.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        self._exits.close()
+
+    @property
+    def tracker_port(self) -> str:
+        return str(self._ports / "ttyPolaris")
+
+    def run(self, model: str | Path, task: str, *options: str) -> subprocess.Popen[bytes]:
+        """Starts modsoft-runtime, unmodified, as anybody would: its console script, beside this interpreter.
+
+        Its log goes to `folder`/runs, what it says to runtime.out and runtime.err. Further options are passed on.
+        """
+        script = Path(sys.executable).parent / "modsoft-runtime"
+        if not script.is_file():
+            raise UsageError(f"no {script.name} beside {Path(sys.executable).name}: pip install modsoft there first")
+        shutil.rmtree(self.folder / "runs", ignore_errors=True)
+        tools = [option for path in self.tool_files for option in ("--tool", str(path))]
+        command = [
+            str(script), "--yes", "--robot", self._robot_file, "--model", str(model), "--task", task,
+            "--port", self.board.port, "--tracker", "ndi", "--tracker-port", self.tracker_port, *tools,
+            "--runs-dir", str(self.folder / "runs"), *options,
+        ]  # fmt: skip
+        with (self.folder / "runtime.out").open("wb") as out, (self.folder / "runtime.err").open("wb") as errors:
+            self.runtime = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=out, stderr=errors, start_new_session=True
+            )
+        return self.runtime
+
+    def wait(self, timeout_s: float, progress: Callable[[int], None] = lambda ticks: None) -> int:
+        """The runtime's exit code; `progress` is told the ticks so far twice a second. `LostInRun` when a part of the
+        rig ended first, or when the runtime takes longer than `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                code = self.runtime.wait(0.5)
+            except subprocess.TimeoutExpired:
+                self.plant.check()
+                self.tracker.check()
+                if time.monotonic() > deadline:
+                    raise LostInRun(f"modsoft-runtime did not end within {timeout_s:.0f} s") from None
+                progress(self.ticks())
+            else:
+                progress(self.ticks())
+                return code
+
+    def settle(self, seconds: float) -> None:
+        """Goes on without the runtime for so long, so that the traces show what became of the robot."""
+        time.sleep(seconds)
+        self.plant.check()
+
+    def run_folder(self) -> Path | None:
+        """Where the runtime logs, as soon as it does."""
+        found = sorted((self.folder / "runs").glob("*/run.jsonl"))
+        return found[-1].parent if found else None
+
+    def ticks(self) -> int:
+        """Ticks in the run log so far."""
+        folder = self.run_folder()
+        return (folder / "run.jsonl").read_bytes().count(b"\n") if folder else 0
+
+    def said(self) -> str:
+        """The runtime's last line on standard error."""
+        lines = (self.folder / "runtime.err").read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+    def _stop_runtime(self) -> None:
+        if self.runtime is None or self.runtime.poll() is not None:
+            return
+        self.runtime.send_signal(signal.SIGINT)
+        try:
+            self.runtime.wait(RUNTIME_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self.runtime.kill()
+            self.runtime.wait()
+
+    # ---- Lines passed on
+
+    def _board_event(self, event: Line) -> None:
+        _write(self._board_log, event)
+        if event["event"] == "pwm":
+            self._changed.set()
+
+    def _forward_duties(self) -> None:
+        while not self._closing.is_set():
+            if self._changed.wait(0.1):
+                self._changed.clear()
+                self.plant.send({"duty": self.board.duties()})
+                time.sleep(FORWARD_PERIOD_S)
+
+    def _plant_state(self, state: Line) -> None:
+        self.tracker.send({"poses": state.pop("poses")})
+        with contextlib.suppress(DeviceAbsent):  # it starts after the plant and ends before it
+            for channel, pressure_bar in state["channel_bar"].items():
+                if self.board.ready and int(channel) < SENSED_CHANNELS:
+                    self.board.send(f"adc {channel} {self.board.millivolt(pressure_bar)}")
+        self.plant_states.append(state)
+        _write(self._plant_log, state)
+
+
+def _write(log: IO[str], line: Line) -> None:
+    log.write(json.dumps(line) + "\n")
