@@ -38,7 +38,9 @@ def record():
         end_ns=ticks * 400_000_000,
         valves=Valves(np.array([0]), np.zeros((1, 12)), 4096),
         board_events=[],
-        board_summary={"rx_dropped": 0, "late_max_ms": 0.4},
+        board_dropped_bytes=0,
+        board_late_ms=0.4,
+        board_summary={},
         plant_mono_ns=np.arange(slices) * 20_000_000,
         plant_configuration=np.repeat(from_angles_deg(angles + np.array([0.5, -2.0])), 20, axis=0),
         plant_bar=np.zeros((slices, 2, 2)),
@@ -80,7 +82,7 @@ def test_a_run_that_failed_before_its_first_tick_has_a_report_too(record, tmp_pa
 
 
 def test_what_a_slow_host_voids_is_marked(record):
-    slow = replace(record, board_summary={"rx_dropped": 0, "late_max_ms": 300.0})
+    slow = replace(record, board_late_ms=300.0)
     text = report.text(slow, judge(slow), {}, report.figures(slow))
     assert "not judged: the host was too slow" in text
     assert "| lateness of a tick, 99th percentile | 1.00 ms | < 20 ms | void |" in text
