@@ -10,8 +10,9 @@ import msgspec
 import torch
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.artefact import Network
 from modsoft.runtime.configuration import feature_names
-from modsoft.runtime.errors import ModelError
+from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.training import checkpoint as checkpoints
 
 UNTOLD = (
@@ -80,21 +81,32 @@ def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
     }
 
 
+def network_of(checkpoint: dict[str, Any], where: str = "checkpoint") -> Network:
+    """The sizes that the checkpoint says its network has; `ModelError` for another network than the biLSTM."""
+    try:
+        found = {name: value for name, value in checkpoint["network"].items() if name in Network.__struct_fields__}
+        return msgspec.convert(found, Network)
+    except (AttributeError, msgspec.ValidationError) as error:
+        raise ModelError(f"{where}: network: {error}; expected the sizes of a biLSTM, no other is exported") from error
+
+
 def _check(checkpoint: dict[str, Any], path: Path) -> None:
     """What the checkpoint says of itself holds together, and its weights are finite float32."""
-    robot = robots.from_dict(checkpoint["robot"], f"{path}: robot")
-    network, kind = checkpoint["network"], robot.robot.kind
-    if network.get("name") != "bilstm":
-        raise ModelError(f"{path}: network {network.get('name')!r}, expected 'bilstm'; no other can be exported")
-    expected = feature_names(kind, network["history"])
+    try:
+        robot = robots.from_dict(checkpoint["robot"], f"{path}: robot")
+    except RobotFileError as error:  # of this file, not of a robot file that the user can mend
+        raise ModelError(f"{error}; train it again with this version") from error
+    network = network_of(checkpoint, str(path))
+    kind, history = robot.robot.kind, network.history
+    expected = feature_names(kind, history)
     if list(checkpoint["features"]) != expected:
         raise ModelError(f"{path}: features {list(checkpoint['features'])}, expected for {kind} {expected}")
     for name, found, wanted in (
-        ("feature_size", network["feature_size"], len(expected)),
-        ("action_size", network["action_size"], robot.action_size),
+        ("feature_size", network.feature_size, len(expected)),
+        ("action_size", network.action_size, robot.action_size),
     ):
         if found != wanted:
-            raise ModelError(f"{path}: {name} {found}, expected {wanted} for {kind} and history {network['history']}")
+            raise ModelError(f"{path}: {name} {found}, expected {wanted} for {kind} and history {history}")
     for name, tensor in checkpoint["weights"].items():
         if tensor.dtype != torch.float32:
             raise ModelError(f"{path}: weight {name} is {tensor.dtype}, expected torch.float32")

@@ -12,7 +12,7 @@ import msgspec
 from modsoft.export import graph, parity, source
 from modsoft.runtime import artefact
 from modsoft.runtime import robot as robots
-from modsoft.runtime.artefact import Description, Golden, Network
+from modsoft.runtime.artefact import Description, Golden
 from modsoft.runtime.controller import Controller
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.training import checkpoint as checkpoints
@@ -65,7 +65,7 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
 
 def describe(checkpoint: dict[str, Any], weights: graph.Weights, expected: parity.Reference) -> Description:
     """The description of the model to be, its seal not yet set."""
-    robot, network = robots.from_dict(checkpoint["robot"]), checkpoint["network"]
+    robot = robots.from_dict(checkpoint["robot"])
     return Description(
         schema=artefact.SCHEMA,
         file_sha256=artefact.UNSEALED,
@@ -80,7 +80,7 @@ def describe(checkpoint: dict[str, Any], weights: graph.Weights, expected: parit
         modules_trained_on=[robot.modules],
         features=list(checkpoint["features"]),
         label=artefact.LABEL,
-        network=Network(**{field: network[field] for field in Network.__struct_fields__}),
+        network=source.network_of(checkpoint),
         tolerance=expected.tolerance,
         golden=[
             Golden(features=expected.features[n][0].tolist(), actuation=expected.actuation[n][0].tolist())

@@ -92,10 +92,11 @@ def describe(text: str, where: str) -> Description:
 
 
 def sealed(model: bytes) -> bytes:
-    """The serialised model, whose description has `UNSEALED` for a seal, with its seal set."""
+    """The serialised model, whose description has `UNSEALED` for a seal, with its seal set. `ModelError` when the
+    provenance, say, has another entry that looks like a seal."""
     found = list(_SEAL.finditer(model))
     if len(found) != 1 or found[0][1] != UNSEALED.encode():
-        raise ValueError(f"{len(found)} places for a seal in the model, expected one, unset")
+        raise ModelError(f"{len(found)} entries file_sha256 in the model, expected one, unset; rename the others")
     start, end = found[0].span(1)
     return model[:start] + hashlib.sha256(model).hexdigest().encode() + model[end:]
 

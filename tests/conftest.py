@@ -1,0 +1,45 @@
+"""Small trained-looking models for every part that needs one. The numbers are random; the formats are real."""
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def make_checkpoint():
+    """make_checkpoint(path, robot="pneumatic-3", ...) writes a random checkpoint; gain scales its weights up."""
+
+    def make(path, robot="pneumatic-3", history=3, layers=2, hidden=8, gain=1.0, seed=0):
+        import torch
+
+        from modsoft.runtime import robot as robots
+        from modsoft.runtime.configuration import feature_names
+        from modsoft.training import checkpoint as checkpoints
+        from modsoft.training.networks import BiLSTM
+
+        found = robots.load(robot)
+        names = feature_names(found.robot.kind, history)
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            network = BiLSTM(len(names), found.action_size, layers, hidden)
+        sizes = {"name": "bilstm", "feature_size": len(names), "action_size": found.action_size, "layers": layers}
+        checkpoints.save(
+            {
+                "schema": checkpoints.SCHEMA,
+                "robot": found.to_dict(),
+                "network": {**sizes, "hidden": hidden, "dropout": 0.1, "history": history},
+                "features": names,
+                "weights": {name: gain * tensor for name, tensor in network.state_dict().items()},
+                "provenance": {"data_sha256": "0" * 64, "seed": seed, "errors_percent": [1.0, None]},
+            },
+            path,
+        )
+        return path
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def model_file(tmp_path_factory, make_checkpoint):
+    """A small model.onnx for pneumatic robots, history 3, exported and checked as any other. Not to be changed."""
+    from modsoft.export.write import export
+
+    return export(make_checkpoint(tmp_path_factory.mktemp("model") / "model.pt")).path

@@ -1,0 +1,234 @@
+"""Planted faults: each check refuses what it is there for, and the export refuses every one of them."""
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import helper, numpy_helper
+
+from modsoft.export import graph, parity, write
+from modsoft.export.write import export
+from modsoft.runtime.controller import Unit
+from modsoft.runtime.errors import ModelError
+from modsoft.training import checkpoint as checkpoints
+
+
+def change(model, name, function):
+    """Replaces the initializer `name` by function(array)."""
+    for tensor in model.graph.initializer:
+        if tensor.name == name:
+            array = numpy_helper.to_array(tensor).copy()
+            tensor.CopyFrom(numpy_helper.from_array(np.ascontiguousarray(function(array)), name))
+            return
+    raise KeyError(name)
+
+
+def node_of(model, output):
+    return next(node for node in model.graph.node if output in node.output)
+
+
+def swapped_gates(model):
+    def swap(w):
+        i, o, f, c = np.split(w, 4, axis=1)
+        return np.concatenate([i, f, o, c], axis=1)
+
+    change(model, "layer_2_W", swap)
+
+
+def swapped_directions(model):
+    for part in "WRB":
+        change(model, f"layer_1_{part}", lambda array: array[::-1])
+
+
+def dropped_recurrent_bias(model):
+    change(model, "layer_1_B", lambda b: b * (np.arange(b.shape[1]) < b.shape[1] // 2).astype(np.float32))
+
+
+def another_layers_weights(model):
+    node_of(model, "layer_2_Y").input[2] = "layer_1_R"
+
+
+def one_changed_weight(model):
+    def nudge(w):
+        w[0, 3, 1] = np.nextafter(w[0, 3, 1], np.float32(9))
+        return w
+
+    change(model, "layer_2_R", nudge)
+
+
+def swapped_neighbours(model):
+    change(model, "layer_1_h_rows", lambda rows: rows[::-1])
+
+
+def swapped_outputs(model):
+    for one, other in (("h_to_tip_rows", "h_to_base_rows"), ("c_to_tip_rows", "c_to_base_rows")):
+        a, b = node_of(model, one[:-5]), node_of(model, other[:-5])
+        a.input[1], b.input[1] = b.input[1], a.input[1]
+
+
+def deaf_layer(model):
+    lstm = node_of(model, "layer_2_Y")
+    lstm.input[5], lstm.input[6] = "", ""
+
+
+def bypassed_guard(model):
+    node_of(model, "actuation").input[1] = "zero"
+    model.graph.initializer.append(numpy_helper.from_array(np.zeros((), np.float32), "zero"))
+
+
+def guard_deaf_to_neighbours(model):
+    node_of(model, "sum_of_inputs").input[1] = "sum_of_features"
+
+
+def guard_deaf_to_the_label(model):
+    """Sums all features but the last."""
+    node = node_of(model, "sum_of_features")
+    size = model.graph.input[0].type.tensor_type.shape.dim[2].dim_value
+    at = list(model.graph.node).index(node)
+    for name, value in (("ends", [size - 1]), ("starts", [0]), ("axes", [2])):
+        model.graph.initializer.append(numpy_helper.from_array(np.array(value, np.int64), name))
+    model.graph.node.insert(at, helper.make_node("Slice", ["features", "starts", "ends", "axes"], ["some"]))
+    node.input[0] = "some"
+
+
+def frozen_module_number(model):
+    for value in (model.graph.input[0], model.graph.output[0]):
+        value.type.tensor_type.shape.dim[1].dim_value = 3
+
+
+def missing_weight(model):
+    tensor = next(tensor for tensor in model.graph.initializer if tensor.name == "layer_1_W")
+    model.graph.initializer.remove(tensor)
+
+
+def another_opset(model):
+    model.opset_import[0].version = 20
+
+
+FAULTS = {
+    fault.__name__: fault
+    for fault in (
+        swapped_gates,
+        swapped_directions,
+        dropped_recurrent_bias,
+        another_layers_weights,
+        one_changed_weight,
+        swapped_neighbours,
+        swapped_outputs,
+        deaf_layer,
+        bypassed_guard,
+        guard_deaf_to_neighbours,
+        guard_deaf_to_the_label,
+        frozen_module_number,
+        missing_weight,
+        another_opset,
+    )
+}
+
+# What each check alone finds. Where a fault stands under several, each was seen to refuse it by itself.
+CHECKS = {
+    "graph": {"missing_weight", "another_opset"},
+    "weights": {
+        "swapped_gates",
+        "swapped_directions",
+        "dropped_recurrent_bias",
+        "one_changed_weight",
+        "missing_weight",
+    },
+    "fused": {
+        "swapped_gates",
+        "swapped_directions",
+        "dropped_recurrent_bias",
+        "another_layers_weights",
+        "frozen_module_number",  # refused as the runtime's session looks at the graph's border
+    },
+    "chain": {"swapped_neighbours", "swapped_outputs", "deaf_layer"},
+    "guard": {"bypassed_guard", "guard_deaf_to_neighbours", "guard_deaf_to_the_label"},
+}
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory, make_checkpoint):
+    """A sound export: its checkpoint, network, reference and model file."""
+    checkpoint = make_checkpoint(tmp_path_factory.mktemp("sound") / "model.pt")
+    network = checkpoints.network_of(checkpoints.load(checkpoint))
+    return checkpoint, network, parity.reference(network), export(checkpoint).path
+
+
+def run(check, path, network, expected):
+    weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+    if check == "graph":
+        return parity.check_graph(path)
+    if check == "weights":
+        return parity.check_weights(path, weights, network.lstm.num_layers)
+    if check == "fused":
+        return parity.check_fused(Unit(path.read_bytes()), expected)
+    if check == "chain":
+        return parity.check_chain(Unit(path.read_bytes()), expected)
+    return parity.check_guard(Unit(path.read_bytes()), expected)
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_sound_file_passes_each_check(check, sound):
+    _, network, expected, path = sound
+    run(check, path, network, expected)
+
+
+@pytest.mark.parametrize(("check", "fault"), [(check, fault) for check in CHECKS for fault in sorted(CHECKS[check])])
+def test_each_check_finds_its_faults(check, fault, sound, tmp_path):
+    _, network, expected, path = sound
+    model = onnx.load(path)
+    FAULTS[fault](model)
+    spoilt = tmp_path / "spoilt.onnx"
+    spoilt.write_bytes(model.SerializeToString())
+    with pytest.raises(ModelError):
+        run(check, spoilt, network, expected)
+
+
+def test_every_fault_is_some_checks():
+    assert set(FAULTS) == set().union(*CHECKS.values())
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_export_refuses_and_leaves_nothing(fault, sound, tmp_path, monkeypatch):
+    checkpoint, *_ = sound
+    build = graph.build
+
+    def spoilt(*arguments):
+        model = build(*arguments)
+        FAULTS[fault](model)
+        return model
+
+    monkeypatch.setattr(write.graph, "build", spoilt)
+    with pytest.raises(ModelError, match="not written"):
+        export(checkpoint, tmp_path / "model.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_fixed_bound_where_torch_is_exact_and_none_beyond_a_thousandth():
+    for torch_error, bound in ((0.0, 1e-5), (1e-7, 1e-5), (2e-5, 2e-4), (1.0, 1e-3)):
+        assert parity.Reference({}, {}, torch_error, 2.0).bound == pytest.approx(bound)
+    assert parity.Reference({}, {}, 2e-5, 2.0).tolerance == pytest.approx(4e-4)
+
+
+def test_a_network_that_ignores_its_neighbours_is_refused(sound, tmp_path, make_checkpoint):
+    """The negative control: without recurrent weights a chain is right at once, and so proves nothing."""
+    network = checkpoints.network_of(checkpoints.load(make_checkpoint(tmp_path / "model.pt")))
+    with torch.no_grad():
+        for name, weight in network.named_parameters():
+            if "weight_hh" in name:
+                weight.zero_()
+            elif "bias" in name and "lstm" in name:  # forget gate shut: the cell state carries nothing either
+                weight[weight.shape[0] // 4 : weight.shape[0] // 2] = -100.0
+    expected = parity.reference(network)
+    weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+    unit = Unit(graph.build(weights, 2, "{}").SerializeToString())
+    parity.check_fused(unit, expected)
+    with pytest.raises(ModelError, match="no difference"):
+        parity.check_chain(unit, expected)
+
+
+def test_a_network_deaf_to_its_features_is_refused(make_checkpoint, tmp_path):
+    with pytest.raises(ModelError, match="depend on them"):
+        export(make_checkpoint(tmp_path / "model.pt", gain=0.0))
+    assert [entry.name for entry in tmp_path.iterdir()] == ["model.pt"]

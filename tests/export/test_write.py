@@ -1,0 +1,228 @@
+"""From a checkpoint to a model file, what is refused on the way, and the command."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from modsoft.export import cli, write
+from modsoft.export.write import export
+from modsoft.runtime.controller import Controller
+from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.training import checkpoint as checkpoints
+
+META = """
+robot = "cable-4"
+history = 3
+label = "base -1, tip +1"
+features = "states and actions by time step, then label"
+[provenance]
+from = "elsewhere"
+"""
+
+
+@pytest.fixture
+def model(tmp_path, make_checkpoint):
+    return make_checkpoint(tmp_path / "model.pt")
+
+
+def modsoft_export(monkeypatch, *arguments):
+    """The exit code of the command."""
+    monkeypatch.setattr(sys, "argv", ["modsoft-export", *map(str, arguments)])
+    with pytest.raises(SystemExit) as leaving:
+        cli.main()
+    return leaving.value.code
+
+
+@pytest.mark.parametrize(("robot", "history", "gain"), [("pneumatic-3", 10, 1.0), ("cable-4", 5, 3.0)])
+def test_full_size(tmp_path, make_checkpoint, robot, history, gain):
+    """Table S1's network, also with weights large enough to saturate it."""
+    checkpoint = make_checkpoint(tmp_path / "model.pt", robot, history, layers=4, hidden=128, gain=gain)
+    exported = export(checkpoint)
+    assert exported.path == tmp_path / "model.onnx"
+    assert exported.path.stat().st_size < 5.6e6
+    report = exported.report
+    assert list(report.fused) == list(report.chain) == [2, 3, 4, 5, 6, 7, 8, 16, 64]
+    assert max(report.fused.values()) <= report.bound
+    assert max(report.chain.values()) <= report.bound
+    assert max(report.one_sweep_fewer.values()) > report.bound
+    network = checkpoints.network_of(checkpoints.load(checkpoint))
+    controller = Controller.load(exported.path)
+    assert controller.history == history
+    x = np.random.default_rng(5).uniform(-1, 1, (9, controller.unit.feature_size))  # no N that was checked
+    with torch.no_grad():
+        expected = network(torch.from_numpy(x).float()[None])[0].numpy()
+    np.testing.assert_allclose(controller.actuate(x), expected, atol=1e-5)
+
+
+def test_description_says_all(model):
+    said = export(model).description
+    stored = checkpoints.load(model)
+    assert (said.kind, said.state_size, said.action_size, said.period_s) == ("pneumatic", 2, 1, 0.4)
+    assert (said.modules_trained_on, said.network.history) == ([3], 3)
+    assert said.features == stored["features"]
+    assert said.robot["robot"]["name"] == "pneumatic-3"
+    assert said.provenance == stored["provenance"]
+    assert [len(pair.features) for pair in said.golden] == [2, 6]
+    assert len(said.file_sha256) == 64
+    assert said.file_sha256 != "0" * 64
+
+
+def test_weights_hash_is_the_weights(tmp_path, make_checkpoint):
+    one, other = (export(make_checkpoint(tmp_path / f"{seed}.pt", seed=seed)).description for seed in (1, 2))
+    again = export(make_checkpoint(tmp_path / "again.pt", seed=1)).description
+    assert one.weights_sha256 == again.weights_sha256 != other.weights_sha256
+    assert one.file_sha256 == again.file_sha256  # nothing but the checkpoint goes into the file
+
+
+def of(weights, change):
+    return {name: change(tensor) for name, tensor in weights.items()}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (lambda c: {"features": c["features"][::-1]}, "features .* expected for pneumatic"),
+        (lambda c: {"network": {**c["network"], "history": 4}}, "expected for pneumatic"),
+        (lambda c: {"network": {**c["network"], "name": "lstm"}}, "network: Invalid enum value 'lstm'"),
+        (lambda c: {"network": {**c["network"], "hidden": 9}}, "do not fit"),
+        (lambda c: {"network": {k: v for k, v in c["network"].items() if k != "history"}}, "required field `history`"),
+        (lambda c: {"robot": {**c["robot"], "wheels": 4}}, "wheels"),
+        (lambda c: {"weights": of(c["weights"], lambda t: t.double())}, "float64, expected torch.float32"),
+        (lambda c: {"weights": of(c["weights"], lambda t: t * float("nan"))}, "not finite"),
+        (lambda c: {"provenance": {"file_sha256": "0" * 64}}, "file_sha256"),
+        (lambda c: {"provenance": {"mean": torch.zeros(2)}}, "no plain value"),
+        (lambda c: {"schema": 99}, "schema 99"),
+    ],
+)
+def test_refused_checkpoints(model, changes, message):
+    stored = checkpoints.load(model)
+    checkpoints.save({**stored, **changes(stored)}, model)
+    with pytest.raises(ModelError, match=message):
+        export(model)
+    assert not model.with_suffix(".onnx").exists()
+
+
+def test_a_checkpoint_that_would_run_code_or_holds_numpy_is_refused(tmp_path):
+    torch.save({"weights": np.float64(1.0)}, tmp_path / "model.pt")
+    with pytest.raises(ModelError, match="not a checkpoint"):
+        export(tmp_path / "model.pt")
+
+
+def test_the_old_file_stays_when_the_new_one_is_refused(model, monkeypatch):
+    path = export(model).path
+    before = path.read_bytes()
+
+    def refuse(*_):
+        raise ModelError("a check says no")
+
+    monkeypatch.setattr(write.parity, "verify", refuse)
+    with pytest.raises(ModelError, match=r"model.onnx not written: a check says no"):
+        export(model)
+    assert path.read_bytes() == before
+    assert sorted(entry.name for entry in path.parent.iterdir()) == ["model.onnx", "model.pt"]
+
+
+def test_disk_full_leaves_nothing(model, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(ModelError, match="No space left"):
+        export(model)
+    assert [entry.name for entry in model.parent.iterdir()] == ["model.pt"]
+
+
+def test_out_must_be_a_file_in_a_folder(model, tmp_path):
+    for out in (tmp_path / "nowhere" / "model.onnx", tmp_path):
+        with pytest.raises(UsageError, match="--out"):
+            export(model, out)
+
+
+@pytest.fixture
+def bare(tmp_path, make_checkpoint):
+    """A bare state dict and its meta file."""
+    stored = checkpoints.load(make_checkpoint(tmp_path / "whole.pt", "cable-4"))
+    torch.save(stored["weights"], tmp_path / "bare.pt")
+    (tmp_path / "meta.toml").write_text(META)
+    return tmp_path / "bare.pt", tmp_path / "meta.toml"
+
+
+def test_bare_state_dict_needs_a_meta_file(bare):
+    weights, meta = bare
+    with pytest.raises(ModelError, match=r"bare state dict.*robot.*history.*label.*--meta"):
+        export(weights)
+    assert export(weights, meta=meta).description.weights_sha256 == (
+        export(weights.with_name("whole.pt")).description.weights_sha256
+    )
+    assert Controller.load(weights.with_suffix(".onnx")).description.provenance == {"from": "elsewhere"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("history = 3", "history = 4", "feature_size 16, expected 21"),
+        ('"cable-4"', '"pneumatic-3"', "feature_size 16, expected 10"),
+        ("base -1, tip +1", "base +1, tip -1", "label"),
+        ("history = 3", "", "history"),
+        ("history = 3", "history = ", "meta.toml"),
+        ("history = 3", "history = 3\ncolour = 1", "colour"),
+    ],
+)
+def test_wrong_meta_files(bare, old, new, message):
+    weights, meta = bare
+    meta.write_text(META.replace(old, new))
+    with pytest.raises(ModelError, match=message):
+        export(weights, meta=meta)
+
+
+def test_meta_only_for_a_bare_state_dict(bare):
+    _, meta = bare
+    with pytest.raises(ModelError, match="leave --meta out"):
+        export(meta.with_name("whole.pt"), meta=meta)
+    with pytest.raises(ModelError, match=r"none.toml: cannot be read"):
+        export(meta.with_name("bare.pt"), meta=meta.with_name("none.toml"))
+
+
+def test_command(model, monkeypatch, capsys):
+    assert modsoft_export(monkeypatch, model) == 0
+    shown = capsys.readouterr().out
+    assert "model.onnx" in shown
+    assert "64" in shown
+    assert modsoft_export(monkeypatch, "--inspect", model.with_suffix(".onnx")) == 0
+    shown = capsys.readouterr().out
+    for word in ("features [1, N, 10]", "h_from_base [2, 1, 8] default 0", "v_x[desired]", "period_s: 0.4", "eq. 1"):
+        assert word in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "word"),
+    [
+        (["nothing.pt"], 65, "no model file"),
+        (["--inspect", "nothing.onnx"], 65, "no model file"),
+        (["--inspect", "model.pt"], 65, "run modsoft-export on it"),
+        (["--inspect", "model.pt", "--out", "x"], 2, "--inspect"),
+        ([], 2, "MODEL"),
+        (["model.pt", "--out", "no/where.onnx"], 2, "--out"),
+    ],
+)
+def test_command_refuses_in_one_line(model, monkeypatch, capsys, arguments, code, word):
+    monkeypatch.chdir(model.parent)
+    assert modsoft_export(monkeypatch, *arguments) == code
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert word in lines[-1]
+    assert code == 2 or len(lines) == 1
+
+
+def test_help_needs_no_torch():
+    script = (
+        "import sys; sys.argv = ['modsoft-export', '--help']\n"
+        "from modsoft.export.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: sys.exit('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert "modsoft-export model.pt" in done.stdout
