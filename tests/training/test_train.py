@@ -1,0 +1,150 @@
+"""Training: it learns, it is deterministic, and a cut run ends as one that was not cut."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.configuration import feature_names, from_angles_deg
+from modsoft.runtime.errors import ModelError
+from modsoft.training import checkpoint as checkpoints
+from modsoft.training import dataset, train
+
+SMALL = train.Settings(history=3, iterations=60, batch=32, layers=2, hidden=8)
+
+
+def make(episodes: int = 10, steps: int = 30, seed: int = 0) -> dataset.DataSet:
+    """A robot whose modules bend at once by 40 degrees times their action, less 10 times the next module's."""
+    robot = robots.load("pneumatic-3")
+    action = np.random.default_rng(seed).uniform(-1, 1, (episodes, steps, 3, 1))
+    angles = np.zeros((episodes, steps + 1, 3))
+    angles[:, 1:] = 40 * action[..., 0] - 10 * np.roll(action[..., 0], -1, axis=-1)
+    return dataset.DataSet(
+        recipe={"robot": robot.to_dict(), "strategy": "random", "seed": seed, "steps": steps},
+        configuration=from_angles_deg(angles),
+        action=action,
+        stage_borders=np.array([0, steps]),
+        redrawn=0,
+    )
+
+
+def equal(one: dict, other: dict) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_it_learns_and_the_checkpoint_says_all(tmp_path):
+    out = tmp_path / "model.pt"
+    data = make(20)
+    told = []
+    train.train(data, out, dataclasses.replace(SMALL, iterations=600, rate=0.01, dropout=0.0), told.append)
+    assert list(tmp_path.iterdir()) == [out]
+    found = checkpoints.load(out)
+    assert robots.from_dict(found["robot"]) == data.robot
+    assert found["features"] == feature_names("pneumatic", 3)
+    assert found["network"]["history"] == 3
+    assert found["provenance"]["data_sha256"] == data.sha256()
+    assert found["provenance"]["samples"] == 600
+    # Guessing 0 would be 25 percent of the range in the mean.
+    errors = found["provenance"]["errors_percent"]
+    assert len(errors) == len(found["provenance"]["errors_std_percent"]) == 3
+    assert max(errors) < 5.0
+    # and they are those of the weights in the file, on the test part
+    _, _, test = dataset.split(data, 3, "blocks", 0)
+    again = train.estimation_errors(checkpoints.network_of(found), test)
+    np.testing.assert_allclose(again.mean(dim=(0, 2)).numpy(), errors, atol=1e-3)
+    assert told[-1].share == 1.0
+    assert told[-1].validation_percent == pytest.approx(found["provenance"]["validation_percent"])
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
+    one, again, other = (
+        train.train(make(), tmp_path / "model.pt", dataclasses.replace(SMALL, seed=seed))["weights"]
+        for seed in (0, 0, 1)
+    )
+    assert equal(one, again)
+    assert not equal(one, other)
+
+
+class Cut(Exception):
+    """Stands for a kill: nothing of the run is told that it comes."""
+
+
+@pytest.mark.parametrize("checks", [1, 7, 15])
+def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, checks):
+    straight = train.train(make(), tmp_path / "straight.pt", SMALL)
+    out = tmp_path / "cut.pt"
+    seen = []
+
+    def cut(told):
+        seen.append(told)
+        if len(seen) > checks:  # before this check is saved: the work since the one before is lost
+            raise Cut
+
+    with pytest.raises(Cut):
+        train.train(make(), out, SMALL, cut)
+    assert not out.exists()
+    torch.manual_seed(123)  # a new process has another random state
+    resumed = []
+    found = train.train(make(), out, SMALL, resumed.append)
+    assert resumed[0].iteration == checks * (SMALL.iterations // train.CHECKS) + SMALL.iterations // train.CHECKS
+    assert equal(found["weights"], straight["weights"])
+    assert found["provenance"]["errors_percent"] == straight["provenance"]["errors_percent"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.pt", "straight.pt"]
+
+
+def test_a_cut_run_of_other_settings_or_data_is_refused(tmp_path):
+    out = tmp_path / "model.pt"
+
+    def cut(told):
+        if told.iteration > 6:
+            raise Cut
+
+    with pytest.raises(Cut):
+        train.train(make(), out, SMALL, cut)
+    with pytest.raises(ModelError, match=r"model.pt.resume: of a run with batch 32, asked for 64"):
+        train.train(make(), out, dataclasses.replace(SMALL, batch=64))
+    with pytest.raises(ModelError, match="of a run with data_sha256"):
+        train.train(make(seed=1), out, SMALL)
+    resume = tmp_path / "model.pt.resume"
+    resume.write_bytes(resume.read_bytes()[:1000])
+    with pytest.raises(ModelError, match=r"model.pt.resume: not a checkpoint"):
+        train.train(make(), out, SMALL)
+
+
+def test_it_stops_early_and_keeps_the_best_weights(tmp_path):
+    """Targets without any rule: the validation error only gets worse as the network learns them by heart."""
+    data = make()
+    data.action[:] = np.random.default_rng(5).uniform(-1, 1, data.action.shape)
+    told = []
+    settings = dataclasses.replace(SMALL, iterations=4000, rate=0.02, hidden=32, dropout=0.0)
+    found = train.train(data, tmp_path / "model.pt", settings, told.append)
+    best = min(t.validation_percent for t in told)
+    assert found["provenance"]["iterations_done"] < 4000
+    since = [t.iteration for t in told if t.validation_percent > best or t is told[0]]
+    assert found["provenance"]["iterations_done"] - max(since) >= train.PATIENCE * 200
+    _, validation, _ = dataset.split(data, 3, "blocks", 0)
+    again = float(train.estimation_errors(checkpoints.network_of(found), validation).mean())
+    assert again == pytest.approx(best, abs=1e-4)
+
+
+def test_a_budget_of_minutes_ends_the_run_with_its_learning_rate_at_nothing(tmp_path):
+    now = iter(np.arange(0.0, 1e6, 0.5))  # every look at the clock takes half a second
+    told = []
+    settings = dataclasses.replace(SMALL, iterations=100000, minutes=0.5)
+    found = train.train(make(), tmp_path / "model.pt", settings, told.append, clock=lambda: float(next(now)))
+    assert found["provenance"]["seconds"] == pytest.approx(30, abs=2)
+    assert told[-1].share >= 1.0
+    assert found["provenance"]["iterations_done"] < 100
+
+
+def test_the_learning_rate_is_one_cycle():
+    shares = np.linspace(0, 1, 1001)
+    rates = np.array([train.one_cycle(share, 0.003) for share in shares])
+    assert rates[0] == pytest.approx(0.003 * 0.04)
+    assert rates[-1] == pytest.approx(0.0, abs=1e-9)
+    assert shares[rates.argmax()] == pytest.approx(0.3)
+    assert rates.max() == pytest.approx(0.003)
+    assert np.all(np.diff(rates[:301]) > 0)
+    assert np.all(np.diff(rates[300:]) < 0)

@@ -1,0 +1,85 @@
+"""modsoft-train as a command, killed for real."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.configuration import from_angles_deg
+from modsoft.training import checkpoint as checkpoints
+from modsoft.training import dataset
+
+QUICK = ["--iterations", "60", "--history", "3", "--batch", "8"]
+
+
+def command(folder: Path, *arguments: str) -> list[str]:
+    return [sys.executable, "-m", "modsoft.training.train_cli", *arguments]
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run(command(folder, *arguments), cwd=folder, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    robot = robots.load("pneumatic-2")
+    action = np.random.default_rng(0).uniform(-1, 1, (10, 20, 2, 1))
+    angles = np.concatenate([np.zeros((10, 1, 2)), 40 * action[..., 0]], axis=1)
+    recipe = {"robot": robot.to_dict(), "strategy": "random", "seed": 0, "steps": 20}
+    dataset.write(dataset.DataSet(recipe, from_angles_deg(angles), action, np.array([0, 20]), 0), tmp_path / "d.h5")
+    return tmp_path
+
+
+def test_killed_and_started_again_it_ends_with_the_same_model(folder):
+    straight = run(folder, "d.h5", "--out", "straight.pt", *QUICK)
+    assert straight.returncode == 0, straight.stderr
+    assert "module 2: actuation estimated within" in straight.stdout
+    victim = subprocess.Popen(command(folder, "d.h5", "--out", "m.pt", *QUICK), cwd=folder, stderr=subprocess.DEVNULL)
+    resume = folder / "m.pt.resume"
+    patience = time.monotonic() + 60
+    while not resume.exists():
+        assert victim.poll() is None
+        assert time.monotonic() < patience
+    victim.send_signal(signal.SIGKILL)
+    victim.wait()
+    assert not (folder / "m.pt").exists()
+    again = run(folder, "d.h5", "--out", "m.pt", *QUICK)
+    assert again.returncode == 0, again.stderr
+    one, other = (checkpoints.load(folder / name)["weights"] for name in ("straight.pt", "m.pt"))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert not resume.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["none.h5"], 65, "no data set none.h5"),
+        (["bad.h5"], 65, "bad.h5: not a data set"),
+        (["d.h5", "--out", "none/m.pt"], 2, "no folder none"),
+        (["d.h5", "--minutes", "0"], 2, "minutes"),
+        ([], 2, "DATASET"),
+    ],
+)
+def test_mistakes_end_in_one_clear_line(folder, arguments, code, said):
+    (folder / "bad.h5").write_bytes(b"no")
+    found = run(folder, *arguments)
+    assert (found.returncode, found.stdout) == (code, "")
+    assert said in found.stderr
+    assert "Traceback" not in found.stderr
+    if code != 2:
+        assert found.stderr.count("\n") == 1
+
+
+def test_help_comes_without_torch(folder):
+    code = "import sys; from modsoft.training import train_cli; assert 'torch' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code], cwd=folder, check=False).returncode == 0
+    found = run(folder, "--help")
+    assert found.returncode == 0
+    for option in ("--out", "--minutes", "--split", "--seed", "Example"):
+        assert option in found.stdout

@@ -1,0 +1,168 @@
+"""The data set: one HDF5 file of episodes, and the windows that a network learns from.
+
+    configuration   (E, K + 1, N, 3) [v_x, v_y, v_z], row 0 at rest, row t + 1 reached by the action of row t
+    action          (E, K, N, A) in [-1, 1]
+
+Attributes: `RECIPE` (JSON; all that the numbers depend on), `stage_borders` (N + 1 steps within an episode),
+`redrawn` (episodes that were not finite and were drawn again).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.configuration import episode_features, state_of
+from modsoft.runtime.errors import ModelError
+from modsoft.runtime.robot import Robot
+
+SCHEMA = 1
+# Shares of training, validation and test, as in the paper (70/10/20); these are where the second and third begin.
+VALIDATION_FROM, TEST_FROM = 0.7, 0.8
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """Episodes of one robot, all of the same length and each from rest."""
+
+    recipe: dict[str, Any]  # schema, robot, strategy, seed, steps, period_s, plant_sha256, code_version
+    configuration: Array  # (E, K + 1, N, 3)
+    action: Array  # (E, K, N, A)
+    stage_borders: NDArray[np.int64]  # (stages + 1,), 0 to K
+    redrawn: int
+
+    @property
+    def robot(self) -> Robot:
+        return robots.from_dict(self.recipe["robot"], "data set")
+
+    @property
+    def samples(self) -> int:
+        """Control steps in all episodes."""
+        return self.action.shape[0] * self.action.shape[1]
+
+    def sha256(self) -> str:
+        """Of recipe and numbers, so that a model can say what it was trained on."""
+        digest = hashlib.sha256(json.dumps(self.recipe, sort_keys=True).encode())
+        for array in (self.configuration, self.action, self.stage_borders):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+
+def write(data: DataSet, path: Path) -> None:
+    """Writes beside `path` and renames. The same data give the same bytes."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with h5py.File(temporary, "w") as file:
+            file.attrs["schema"] = SCHEMA
+            file.attrs["recipe"] = json.dumps(data.recipe, sort_keys=True)
+            file.attrs["stage_borders"] = data.stage_borders
+            file.attrs["redrawn"] = data.redrawn
+            file.create_dataset("configuration", data=data.configuration)
+            file.create_dataset("action", data=data.action)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read(path: Path) -> DataSet:
+    """Reads a data set; `ModelError` says what was found where it is none, or damaged."""
+    if not path.is_file():
+        raise ModelError(f"no data set {path}; modsoft-collect --out {path} makes one")
+    try:
+        with h5py.File(path, "r") as file:
+            schema = int(file.attrs["schema"])
+            if schema != SCHEMA:
+                raise ModelError(f"{path}: schema {schema}, this version reads {SCHEMA}; collect it again")
+            data = DataSet(
+                recipe=json.loads(file.attrs["recipe"]),
+                configuration=file["configuration"][()],
+                action=file["action"][()],
+                stage_borders=np.asarray(file.attrs["stage_borders"], dtype=np.int64),
+                redrawn=int(file.attrs["redrawn"]),
+            )
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        raise ModelError(f"{path}: not a data set of modsoft-collect, or damaged ({error})") from error
+    _check(data, path)
+    return data
+
+
+def _check(data: DataSet, path: Path) -> None:
+    robot = data.robot
+    episodes, steps = data.action.shape[:2] if data.action.ndim == 4 else (0, 0)
+    expected = {
+        "action": (episodes, steps, robot.modules, robot.action_size),
+        "configuration": (episodes, steps + 1, robot.modules, 3),
+    }
+    for name, shape in expected.items():
+        found = getattr(data, name)
+        if found.shape != shape or found.size == 0:
+            raise ModelError(f"{path}: {name} has the shape {found.shape}, expected {shape}; collect it again")
+        if not np.all(np.isfinite(found)):
+            raise ModelError(f"{path}: {name} holds values that are not finite; collect it again")
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Samples of one part: features (W, N, F) and the actions (W, N, A) to be estimated, float32."""
+
+    features: NDArray[np.float32]
+    targets: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.targets)
+
+
+def split(data: DataSet, history: int, how: str, seed: int) -> tuple[Windows, Windows, Windows]:
+    """Training, validation and test windows, 70/10/20.
+
+    how: "blocks" cuts contiguous blocks of time and drops every window that reaches over a cut; "shuffled" deals
+    single windows at random as the paper does, which leaks, since neighbouring windows share most of their content.
+    """
+    kind = data.robot.robot.kind
+    states = state_of(data.configuration, kind)
+    features = np.stack([episode_features(s, a, history) for s, a in zip(states, data.action, strict=True)])
+    features, targets = features.astype(np.float32), data.action.astype(np.float32)
+    part = _shuffled_parts(data, seed) if how == "shuffled" else _block_parts(data, history)
+    chosen = [Windows(features[part == p], targets[part == p]) for p in range(3)]
+    empty = [name for name, windows in zip(("training", "validation", "test"), chosen, strict=True) if not len(windows)]
+    if empty:
+        raise ModelError(
+            f"{data.samples} samples leave none for {' and '.join(empty)} at history {history}; collect more"
+        )
+    return chosen[0], chosen[1], chosen[2]
+
+
+def _shuffled_parts(data: DataSet, seed: int) -> NDArray[np.int64]:
+    """Part (E, K) of every window: 0, 1 or 2."""
+    place = np.random.default_rng(seed).permutation(data.samples) / data.samples
+    return np.digitize(place, [VALIDATION_FROM, TEST_FROM]).reshape(data.action.shape[:2])
+
+
+def _block_parts(data: DataSet, history: int) -> NDArray[np.int64]:
+    """Part (E, K) of every window, -1 for those dropped.
+
+    Each stage is cut on its own, all episodes' pieces of it laid end to end: so every part holds every stage in its
+    share, with one long run of a real robot as with many short simulated ones.
+    """
+    episodes, steps = data.action.shape[:2]
+    borders = data.stage_borders
+    stage = np.searchsorted(borders, np.arange(steps), side="right") - 1
+    length = np.diff(borders)[stage]
+    place = (np.arange(episodes)[:, None] * length + np.arange(steps) - borders[stage]) / (episodes * length)
+    part = np.digitize(place, [VALIDATION_FROM, TEST_FROM])
+    # The window of step t reaches back to the action of step t - history.
+    whole = np.ones_like(part, dtype=bool)
+    for back in range(1, history + 1):
+        whole[:, back:] &= part[:, back:] == part[:, :-back]
+    return np.where(whole, part, -1)

@@ -1,0 +1,202 @@
+"""Training the biLSTM of Table S1: one loop, read from top to bottom, that can be killed at any time.
+
+`OUT.resume` beside the model holds all that the loop needs to go on; a run that was cut anywhere ends with the same
+weights, bit for bit, as one that was not (with the same number of threads on the same machine, and no time budget).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from modsoft.runtime.configuration import feature_names
+from modsoft.runtime.errors import ModelError
+from modsoft.training import checkpoint as checkpoints
+from modsoft.training.dataset import DataSet, Windows, split
+from modsoft.training.networks import BiLSTM
+
+HISTORY = {"cable": 5, "pneumatic": 10}  # T, Table S1
+ACTUATION_RANGE = 2.0  # errors are told in percent of it
+CHECKS = 20  # looks at the validation error in a whole run, each with a checkpoint
+PATIENCE = 8  # checks without a better one that end the run: a one-cycle rate is at its best only in the end
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the weights depend on, together with the data."""
+
+    history: int  # T
+    iterations: int = 6000
+    minutes: float | None = None  # of wall clock; the learning rate ends its cycle with whichever ends first
+    batch: int = 64  # Table S1
+    rate: float = 3e-3  # peak of the one-cycle learning rate; 0.001 and 0.0003, constant, in Table S1
+    dropout: float = 0.05  # between layers
+    layers: int = 4  # Table S1
+    hidden: int = 128  # Table S1
+    split: str = "blocks"
+    seed: int = 0
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a run tells as it goes on."""
+
+    iteration: int
+    share: float  # of the run, 0 to 1
+    loss: float
+    validation_percent: float  # of the best weights so far
+    samples_per_s: float
+
+
+def one_cycle(share: float, peak: float) -> float:
+    """Learning rate at `share` of the run: rises over the first 30 %, then falls to nothing, both as cosines."""
+    if share < 0.3:
+        return peak * (0.04 + 0.96 * 0.5 * (1 - math.cos(math.pi * share / 0.3)))
+    return peak * 0.5 * (1 + math.cos(math.pi * min(1.0, (share - 0.3) / 0.7)))
+
+
+def estimation_errors(network: torch.nn.Module, windows: Windows) -> torch.Tensor:
+    """|estimated - true actuation| (W, N, A) in percent of the actuation range."""
+    network.eval()
+    with torch.no_grad():
+        pieces = torch.from_numpy(windows.features).split(1024)
+        found = torch.cat([network(piece) for piece in pieces])
+    return (found - torch.from_numpy(windows.targets)).abs() * (100.0 / ACTUATION_RANGE)
+
+
+def train(
+    data: DataSet,
+    out: Path,
+    settings: Settings,
+    progress: Callable[[Progress], None] = lambda told: None,
+    clock: Callable[[], float] = time.monotonic,
+) -> dict[str, Any]:
+    """Trains, writes the checkpoint `out` and gives it. Goes on from `out.resume` where one of the same data and
+    settings is there; one of others is refused. Sets torch's threads and random state for the whole process."""
+    torch.set_num_threads(settings.threads)
+    torch.manual_seed(settings.seed)
+    training, validation, test = split(data, settings.history, settings.split, settings.seed)
+    features, targets = torch.from_numpy(training.features), torch.from_numpy(training.targets)
+    network = BiLSTM(features.shape[-1], targets.shape[-1], settings.layers, settings.hidden, settings.dropout)
+    optimiser = torch.optim.Adam(network.parameters(), lr=settings.rate)
+    identity = {"data_sha256": data.sha256(), **asdict(settings)}
+    state = {"identity": identity, "iteration": 0, "elapsed_s": 0.0, "best": None, "best_percent": math.inf, "worse": 0}
+    resume = out.with_name(f"{out.name}.resume")
+    if resume.is_file():
+        state = _resumed(resume, identity)
+        network.load_state_dict(state["weights"])
+        optimiser.load_state_dict(state["optimiser"])
+        torch.set_rng_state(state["random_state"])
+
+    per_epoch = -(-len(training) // settings.batch)
+    check_every = max(1, settings.iterations // CHECKS)
+    iteration = first = state["iteration"]
+    began_s = clock() - state["elapsed_s"]
+    checked_s, loss_sum = clock(), 0.0
+    order = np.zeros(0)
+    share = _share(iteration, clock() - began_s, settings)
+    while share < 1.0 and state["worse"] < PATIENCE:
+        epoch, step = divmod(iteration, per_epoch)
+        if step == 0 or iteration == first:
+            order = np.random.default_rng([settings.seed, epoch]).permutation(len(training))
+        rows = torch.from_numpy(order[step * settings.batch : (step + 1) * settings.batch])
+        network.train()
+        for group in optimiser.param_groups:
+            group["lr"] = one_cycle(share, settings.rate)
+        loss = torch.nn.functional.mse_loss(network(features[rows]), targets[rows])
+        optimiser.zero_grad()
+        loss.backward()
+        # The first steps at a high rate now and then meet a gradient a hundred times the usual one.
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        iteration += 1
+        loss_sum += loss.item()
+        share = _share(iteration, clock() - began_s, settings)
+
+        if iteration % check_every == 0 or share >= 1.0:
+            percent = float(estimation_errors(network, validation).mean())
+            if percent < state["best_percent"]:
+                weights = {name: value.clone() for name, value in network.state_dict().items()}
+                state.update(best=weights, best_percent=percent, worse=0)
+            else:
+                state["worse"] += 1
+            now_s = clock()
+            done = (iteration - first - 1) % check_every + 1
+            rate = done * settings.batch / max(now_s - checked_s, 1e-9)
+            progress(Progress(iteration, share, loss_sum / done, state["best_percent"], rate))
+            checked_s, loss_sum = now_s, 0.0
+            state.update(
+                iteration=iteration,
+                elapsed_s=now_s - began_s,
+                weights=network.state_dict(),
+                optimiser=optimiser.state_dict(),
+                random_state=torch.get_rng_state(),
+            )
+            checkpoints.save(state, resume)
+
+    if state["best"] is None:
+        raise ModelError(f"{out}: training diverged, no weights have a finite validation error; try a smaller --rate")
+    network.load_state_dict(state["best"])
+    errors = estimation_errors(network, test)
+    checkpoint = {
+        "schema": checkpoints.SCHEMA,
+        "robot": data.recipe["robot"],
+        "network": {
+            "name": "bilstm",
+            "feature_size": features.shape[-1],
+            "action_size": targets.shape[-1],
+            "layers": settings.layers,
+            "hidden": settings.hidden,
+            "dropout": settings.dropout,
+            "history": settings.history,
+        },
+        "features": feature_names(data.robot.robot.kind, settings.history),
+        "weights": state["best"],
+        "provenance": {
+            **identity,
+            "code_version": version("modsoft"),
+            "torch_version": str(torch.__version__),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "strategy": data.recipe["strategy"],
+            "samples": data.samples,
+            "windows": [len(training), len(validation), len(test)],
+            "iterations_done": iteration,
+            "seconds": round(clock() - began_s, 1),
+            "validation_percent": state["best_percent"],
+            # Actuation estimation error of the test part, percent of the range, by module: the paper's Table 1.
+            "errors_percent": [round(float(e), 4) for e in errors.mean(dim=(0, 2))],
+            "errors_std_percent": [round(float(e), 4) for e in errors.std(dim=(0, 2), correction=0)],
+        },
+    }
+    checkpoints.save(checkpoint, out)
+    resume.unlink(missing_ok=True)
+    return checkpoint
+
+
+def _share(iteration: int, elapsed_s: float, settings: Settings) -> float:
+    """How much of the run is over, 0 to 1: by iterations, or by time where a budget is set and ends first."""
+    share = iteration / settings.iterations
+    return share if settings.minutes is None else max(share, elapsed_s / (60.0 * settings.minutes))
+
+
+def _resumed(resume: Path, identity: dict[str, Any]) -> dict[str, Any]:
+    state = checkpoints.read(resume)
+    found = state.get("identity", {})
+    differences = [key for key in identity if found.get(key) != identity[key]]
+    if differences:
+        key = differences[0]
+        raise ModelError(
+            f"{resume}: of a run with {key} {found.get(key)}, asked for {identity[key]}; "
+            "ask for the same to go on, or delete it to start anew"
+        )
+    return state
