@@ -1,0 +1,365 @@
+"""The board at the other end of the serial port: an I/O thread around `Link`, and calls that wait for an answer.
+
+The thread owns the port. It sends the heartbeats, but with the control loop's own counter in them, so that the board
+also notices a loop that is stuck while this thread lives.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, RobotFileError, Tripped
+from modsoft.runtime.link import HELLO_WAIT_S, RESETS, Link, Phase, fault_names, refusal
+from modsoft.runtime.ports import PortInfo, list_ports, open_port
+from modsoft.runtime.protocol import (
+    CHANNELS,
+    PROTOCOL_HASH,
+    UNITS_PER_BAR,
+    Fault,
+    Hello,
+    NackReason,
+    Set,
+    State,
+    Status,
+    VentMode,
+    to_bar,
+    to_units,
+)
+from modsoft.runtime.robot import Robot
+
+__all__ = ["Board", "Port", "PortInfo", "list_ports"]
+
+ARM_WAIT_S = 4.0  # a second of heartbeats, and the ramp of a vent before
+ARM_AGAIN_S = 0.1
+VENT_WAIT_S = 3.0
+LOST_VENT_WAIT_S = 6.0  # a board in its bootloader needs up to 5 s of silence to come back
+CLEAR_WAIT_S = 1.0
+
+
+class Port(Protocol):
+    """What is used of a pyserial port. `read` waits a few milliseconds at most."""
+
+    dtr: bool
+
+    @property
+    def in_waiting(self) -> int: ...
+    def read(self, size: int = 1) -> bytes: ...
+    def write(self, data: bytes) -> int | None: ...
+    def open(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class Board:
+    """A board that has announced itself and speaks this protocol. Use as a context manager: leaving vents and closes.
+
+    port: an open serial port. name: for messages. clock: monotonic seconds. threaded: False drives the port from the
+    calls that wait instead of a thread of its own, for tests on virtual time.
+    Raises `DeviceAbsent` when nothing announces itself, `ProtocolMismatch` when it speaks another protocol.
+    """
+
+    def __init__(
+        self, port: Port, name: str = "port", clock: Callable[[], float] = time.monotonic, threaded: bool = True
+    ) -> None:
+        self.name = name
+        self._port = port
+        self._clock = clock
+        self._link = Link(clock())
+        self._dtr = True
+        self._p_max = 0
+        self._changed = threading.Condition()  # guards the link
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        if threaded:
+            self._thread = threading.Thread(target=self._serve, name="board", daemon=True)
+            self._thread.start()
+        try:
+            self._await_hello()
+        except BaseException:
+            self._shut()
+            raise
+
+    @classmethod
+    def open(cls, name: str, baud: int = 250000) -> Board:
+        """Open the port called `name` for this program alone and wait until the board there has announced itself.
+
+        Raises `DeviceAbsent`, `PortBusy` and `ProtocolMismatch`, each with what to do.
+        """
+        return cls(open_port(name, baud), name)
+
+    # ---- what is known
+
+    @property
+    def hello(self) -> Hello:
+        """What the board said about itself."""
+        assert self._link.hello is not None
+        return self._link.hello
+
+    @property
+    def status(self) -> Status | None:
+        """The board's last word; None before the first."""
+        return self._link.status
+
+    @property
+    def status_age_s(self) -> float:
+        """Seconds since that word."""
+        return self._clock() - self._link.status_at
+
+    @property
+    def applied_bar(self) -> np.ndarray:
+        """(channels,) what the valves are told, bar; NaN before the first STATUS."""
+        return self._bar("applied")
+
+    @property
+    def measured_bar(self) -> np.ndarray:
+        """(channels,) what the sensors read, bar; NaN where there is none."""
+        return self._bar("measured")
+
+    def _bar(self, field: str) -> np.ndarray:
+        status = self._link.status
+        if status is None:
+            return np.full(CHANNELS, np.nan)
+        units = np.array(getattr(status, field), dtype=np.float64)
+        return np.where(units < -0x7FFF, np.nan, units / UNITS_PER_BAR)
+
+    @property
+    def ack_latency_s(self) -> float | None:
+        """Seconds from the writing of the last acknowledged set-points to the acknowledgement."""
+        return self._link.ack_latency_s
+
+    @property
+    def lost(self) -> str | None:
+        """Why the board is lost, or None."""
+        return self._link.lost
+
+    @property
+    def statistics(self) -> dict[str, int]:
+        """Counts since the opening: bytes, bad_frames, refused, sets, missed_acks."""
+        with self._changed:
+            return dict(self._link.counts)
+
+    def check(self) -> None:
+        """Raise `LostInRun` when either side lost the other, `Tripped` when the board latched another fault."""
+        if self._link.lost is not None:
+            raise LostInRun(
+                f"board at {self.name} lost: {self._link.lost}; it vents by itself, check the cable and restart"
+            )
+        status = self._link.status
+        if status is not None and status.faults == Fault.LINK_TIMEOUT:
+            raise LostInRun(f"the board at {self.name} did not hear from us in time and vented by itself; start again")
+        if status is not None and status.faults:
+            raise Tripped(f"the board vented by itself: {fault_names(status.faults)}; mend the cause and start again")
+
+    # ---- what is asked
+
+    def arm(self, robot: Robot) -> None:
+        """Check the board against the robot file and open a session that drives the robot's channels; still vented.
+
+        Raises `ProtocolMismatch` when they differ, `Tripped` on a latched fault, `LostInRun`.
+        """
+        channels = self._match(robot)
+        deadline = self._clock() + ARM_WAIT_S
+        while True:
+            self._wait(lambda: self._link.can_arm, deadline)
+            self.check()
+            with self._changed:
+                self._link.arm(channels, self.hello.p_full)
+            self._wait(lambda: not self._link.busy, deadline)
+            self.check()
+            status = self.status
+            if status is not None and status.state == State.ARMED:
+                self._p_max = self.hello.p_max
+                return
+            nack = self._link.refused
+            if nack is not None and nack.reason != NackReason.STATE:
+                raise ProtocolMismatch(f"board at {self.name} refused to be armed: {refusal(nack)}")
+            if self._clock() >= deadline:
+                state = State(status.state).name if status is not None and status.state in set(State) else "unknown"
+                raise Tripped(f"board at {self.name} did not arm within {ARM_WAIT_S:.0f} s, its state is {state}")
+            self._wait(lambda: False, self._clock() + ARM_AGAIN_S)
+
+    def _match(self, robot: Robot) -> int:
+        """The mask of the robot's channels, after every check that can be made before a valve moves (row by row)."""
+        hello, valve = self.hello, robot.valve
+        if valve is None:
+            raise RobotFileError(f"robot {robot.name} has no valves, so there is nothing to run on a board")
+        checks = (
+            ("valve full scale", hello.p_full, valve.full_scale_bar, "P_FULL", "full_scale_bar"),
+            ("smallest pressure", hello.p_min, valve.p_min_bar, "P_MIN", "p_min_bar"),
+            ("largest pressure", hello.p_max, valve.p_max_bar, "P_MAX", "p_max_bar"),
+        )
+        for what, board_units, robot_bar, constant, key in checks:
+            if board_units != to_units(robot_bar):
+                raise ProtocolMismatch(
+                    f"{what}: the board at {self.name} has {to_bar(board_units):g} bar, the robot file {robot_bar:g}; "
+                    f"correct {constant} in firmware/limits.h and flash it, or {key} in the robot file"
+                )
+        if to_bar(hello.slew) > robot.limits.slew_bar_per_s:
+            raise ProtocolMismatch(
+                f"the board at {self.name} moves pressures at {to_bar(hello.slew):g} bar/s, the robot file allows "
+                f"{robot.limits.slew_bar_per_s:g}; correct SLEW in firmware/limits.h and flash it"
+            )
+        for chamber in robot.chambers:
+            if chamber.channel >= hello.channels:
+                raise ProtocolMismatch(
+                    f"the robot file puts module {chamber.module} side {chamber.side} on channel {chamber.channel}, "
+                    f"the board at {self.name} has channels 0 to {hello.channels - 1}; correct [[chambers]] or "
+                    "CHANNELS_USED in firmware/pins.h"
+                )
+        return sum(1 << chamber.channel for chamber in robot.chambers)
+
+    def set_pressures(self, tick: int, pressures_bar: ArrayLike) -> int:
+        """Hand over the set-points (channels,), bar, of this tick and return at once with their sequence number.
+
+        A shorter row is filled up with 0 (vented). Raises `Tripped` for a value that is no pressure of this robot, and
+        what `check` raises.
+        """
+        self.check()
+        pressures = np.atleast_1d(np.asarray(pressures_bar, dtype=np.float64))
+        if pressures.ndim != 1 or len(pressures) > CHANNELS:
+            raise ValueError(f"pressures of shape {pressures.shape}, expected (channels,), at most {CHANNELS}")
+        if not np.all(np.isfinite(pressures)):
+            raise Tripped(f"no set-point is sent that is not a number: {pressures.tolist()}")
+        units = np.rint(pressures * UNITS_PER_BAR).astype(np.int64)
+        if np.any(units < 0) or np.any(units > self._p_max):
+            raise Tripped(f"set-points {pressures.tolist()} bar leave the range from 0 to {to_bar(self._p_max):g} bar")
+        padded = tuple(units.tolist()) + (0,) * (CHANNELS - len(units))
+        with self._changed:
+            return self._link.set(Set(tick & 0xFFFFFFFF, padded))
+
+    def beat(self, tick: int) -> None:
+        """Publish the control loop's counter on a tick that sends no set-points."""
+        with self._changed:
+            self._link.tick = tick & 0xFFFFFFFF
+
+    def vent(self, mode: VentMode = VentMode.RAMP, timeout_s: float = VENT_WAIT_S) -> bool:
+        """Vent and wait; True only when the board itself said that every valve is at 0.
+
+        A lost board is sent nothing (its own timer vents it); this then only listens whether it says so.
+        """
+        since = self._clock()
+        with self._changed:
+            if self._link.phase is Phase.READY:
+                self._link.vent(mode)
+        if self._link.phase is Phase.READY:
+            self._wait(lambda: self._said_vented(since), self._clock() + timeout_s)
+        if self._link.phase is Phase.LOST:
+            self._wait(lambda: self._said_vented(since), self._clock() + LOST_VENT_WAIT_S)
+        return self._said_vented(since)
+
+    def _said_vented(self, since: float) -> bool:
+        return self._link.vented and self._link.status_at > since and not self._link.busy
+
+    def clear_fault(self, mask: int | None = None) -> bool:
+        """Clear exactly these faults (None: all that are latched); True when the board did. It refuses while a sensor
+        still shows pressure."""
+        status = self.status
+        if mask is None:
+            mask = status.faults if status is not None else 0
+        with self._changed:
+            self._link.clear_fault(mask)
+        self._wait(lambda: not self._link.busy, self._clock() + CLEAR_WAIT_S)
+        return self.status is not None and self.status.faults == 0
+
+    def close(self) -> bool:
+        """Vent, where that is not yet done, and close the port. Returns whether the board said that it is vented."""
+        vented = self._link.phase is Phase.READY and self._link.vented
+        try:
+            return vented or self.vent()
+        finally:
+            self._shut()
+
+    def __enter__(self) -> Board:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # ---- the port
+
+    def _await_hello(self) -> None:
+        self._wait(lambda: self._link.phase is not Phase.WAITING, self._clock() + (HELLO_WAIT_S + 1) * (RESETS + 1))
+        if self._link.foreign_hash is not None:
+            raise ProtocolMismatch(
+                f"the board at {self.name} speaks protocol {self._link.foreign_hash:08x}, this version speaks "
+                f"{PROTOCOL_HASH:08x}: flash the firmware of this version (make -C firmware flash PORT={self.name})"
+            )
+        if self._link.phase is Phase.READY:
+            return
+        if not self._link.gave_up:
+            raise DeviceAbsent(f"board at {self.name}: {self._link.lost}")
+        heard = self._link.counts["bytes"]
+        what = f"{heard} bytes came that are not its language: wrong baud rate?" if heard else "not a byte came"
+        raise DeviceAbsent(
+            f"nothing at {self.name} announced itself as our board, {RESETS} resets included ({what}); "
+            f"another port, or flash the firmware (make -C firmware flash PORT={self.name})"
+        )
+
+    @property
+    def _closed(self) -> bool:
+        return self._stop.is_set() or (self._thread is not None and not self._thread.is_alive())
+
+    def _wait(self, condition: Callable[[], bool], deadline: float) -> None:
+        """Until `condition`, the loss of the board, or the deadline."""
+        with self._changed:
+            lost = self._link.phase is Phase.LOST
+            while not condition() and self._clock() < deadline and not self._closed:
+                if not lost and self._link.phase is Phase.LOST:
+                    return
+                if self._thread is None:
+                    self._pump()
+                else:
+                    self._changed.wait(0.05)
+
+    def _serve(self) -> None:
+        while not self._stop.is_set() and self._pump():
+            pass
+        with self._changed:
+            self._changed.notify_all()
+
+    def _pump(self) -> bool:
+        """One turn: what came, what has to go. False when the port failed."""
+        try:
+            data = self._port.read(max(1, self._port.in_waiting))
+            with self._changed:
+                now = self._clock()
+                if data:
+                    self._link.feed(data, now)
+                out = self._link.poll(now)
+                if data or self._link.phase is Phase.LOST:
+                    self._changed.notify_all()
+            if out:
+                self._port.write(out)
+            if self._link.dtr != self._dtr:
+                self._set_dtr(self._link.dtr)
+        except OSError as error:  # pyserial's own errors are OSErrors too
+            with self._changed:
+                self._link.hang_up(f"the port failed ({error})", self._clock())
+            self._stop.set()
+            return False
+        return True
+
+    def _set_dtr(self, level: bool) -> None:
+        """Reset the board: DTR down, then up."""
+        self._dtr = level
+        try:
+            self._port.dtr = level
+        except OSError:
+            # A pseudo-terminal has no such line; what stands behind it takes the opening as the reset.
+            if level:
+                self._port.close()
+                self._port.open()
+
+    def _shut(self) -> None:
+        self._stop.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(timeout=1.0)
+        self._port.close()

@@ -1,0 +1,93 @@
+"""Serial ports: which are there, which is the board's, and opening one with a clear word when that fails."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+from typing import NamedTuple
+
+import serial
+from serial.tools import list_ports as serial_list_ports
+
+from modsoft.runtime.errors import DeviceAbsent, PortBusy
+
+# Arduino MEGA 2560: Arduino's own identities, and the older and the Italian maker's numbers.
+MEGA_IDENTITIES = {(0x2341, 0x0042), (0x2341, 0x0010), (0x2341, 0x0242), (0x2A03, 0x0042), (0x2A03, 0x0010)}
+BY_ID = Path("/dev/serial/by-id")
+READ_WAIT_S = 0.005  # how long the I/O thread sleeps in a read; bounds how late it writes
+WRITE_WAIT_S = 0.1
+
+
+class PortInfo(NamedTuple):
+    """One serial port. `name` is what to give as --port: under /dev/serial/by-id where that exists, because it stays
+    the same when the board is plugged in elsewhere."""
+
+    name: str
+    device: str
+    description: str
+    vid: int | None
+    pid: int | None
+    serial_number: str | None
+
+    @property
+    def is_mega(self) -> bool:
+        """Whether the USB identity is that of an Arduino MEGA 2560."""
+        return (self.vid, self.pid) in MEGA_IDENTITIES
+
+    def __str__(self) -> str:
+        identity = f" {self.vid:04x}:{self.pid:04x}" if self.vid is not None and self.pid is not None else ""
+        return f"{self.name}{identity} {self.description}{' (Arduino MEGA 2560)' if self.is_mega else ''}"
+
+
+def list_ports() -> list[PortInfo]:
+    """The serial ports of this machine, MEGAs first."""
+    stable = {}
+    if BY_ID.is_dir():
+        stable = {str(link.resolve()): str(link) for link in sorted(BY_ID.iterdir())}
+    ports = [
+        PortInfo(
+            stable.get(str(Path(port.device).resolve()), port.device),
+            port.device,
+            port.description or "",
+            port.vid,
+            port.pid,
+            port.serial_number,
+        )
+        for port in serial_list_ports.comports()
+    ]
+    return sorted(ports, key=lambda port: (not port.is_mega, port.vid is None, port.name))
+
+
+def ports_here() -> str:
+    """The ports of this machine as half a sentence for an error message; those with a USB identity if there are any."""
+    ports = list_ports()
+    usb = [port for port in ports if port.vid is not None]
+    names = [str(port) for port in usb or ports]
+    return f"ports here: {'; '.join(names)}" if names else "there is no serial port on this machine: is it plugged in?"
+
+
+def open_port(name: str, baud: int) -> serial.Serial:
+    """Open a port for this program alone. Raises `DeviceAbsent` (not there), `PortBusy` (in use or not permitted)."""
+    try:
+        port = serial.Serial(name, baud, timeout=READ_WAIT_S, write_timeout=WRITE_WAIT_S, exclusive=True)
+    except (OSError, ValueError) as error:
+        raise _explained(name, error) from error
+    # What lies in the buffer was sent before the board's reset by this very opening.
+    port.reset_input_buffer()
+    return port
+
+
+def _explained(name: str, error: Exception) -> DeviceAbsent | PortBusy:
+    number = getattr(error, "errno", None)
+    text = str(error)
+    if number in (errno.EACCES, errno.EPERM):
+        return PortBusy(
+            f"{name} may not be opened by this user: join the group that owns it (sudo adduser $USER dialout)"
+        )
+    if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "PermissionError" in text:
+        return PortBusy(
+            f"{name} is in use by another program: close it (a serial monitor, another run) and start again"
+        )
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ENOTDIR) or "FileNotFoundError" in text:
+        return DeviceAbsent(f"no board at {name}: no such port; {ports_here()}")
+    return DeviceAbsent(f"no board at {name}: it is no serial port ({text}); {ports_here()}")

@@ -1,0 +1,508 @@
+"""The host's `Board` and the firmware's own source back to back, on one virtual clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from modsoft.runtime import protocol, robot
+from modsoft.runtime.board import Board
+from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, RobotFileError, Tripped
+from modsoft.runtime.protocol import Fault, State, VentMode
+
+BOOT_MS = 840  # the bootloader's window after a reset, as measured on the emulated MEGA
+BOOTLOADER_MS = 4800  # how long it stays once it has heard something
+
+
+class VirtualPort:
+    """A port with a native board behind it; reading lets time pass, a millisecond a step."""
+
+    def __init__(self, make_board, reset_on_open=True, firmware=True):
+        self.make_board = make_board
+        self.board = make_board(boot_id=1, start_ms=0)
+        self.firmware = firmware
+        self.now_ms = 0
+        self.boots_at = 0 if not reset_on_open else BOOT_MS
+        self.resets = 0
+        self.pending = b""
+        self.written = []  # (ms, bytes)
+        self.talked_to_bootloader = 0
+        self.deaf = self.mute = self.unplugged = self.follows = False
+        self.follows = True
+        self._dtr = True
+        self.is_open = True
+
+    def clock(self):
+        return self.now_ms / 1000
+
+    def reset(self):
+        self.resets += 1
+        self.boots_at = self.now_ms + BOOT_MS
+        self.board = self.make_board(boot_id=1 + self.resets, start_ms=0)
+
+    def step(self):
+        self.now_ms += 1
+        if self.now_ms < self.boots_at or not self.firmware:
+            return
+        self.board.now_ms += 1
+        self.board.update()
+        if self.follows:
+            self.board.follow()
+        sent = self.board.drain()
+        self.pending += b"" if self.mute else sent
+
+    def run(self, milliseconds):
+        """Let the board live while the host does nothing."""
+        for _ in range(milliseconds):
+            self.step()
+
+    # ---- what pyserial offers
+
+    @property
+    def in_waiting(self):
+        self._check()
+        return len(self.pending)
+
+    def read(self, size=1):
+        self._check()
+        for _ in range(5):
+            if self.pending:
+                break
+            self.step()
+        data, self.pending = self.pending[:size], self.pending[size:]
+        return data
+
+    def write(self, data):
+        self._check()
+        self.written.append((self.now_ms, data))
+        if self.now_ms < self.boots_at:
+            self.talked_to_bootloader += 1
+            self.boots_at = self.now_ms + BOOTLOADER_MS
+        elif self.firmware and not self.deaf:
+            self.board.feed(data)
+
+    def _check(self):
+        if self.unplugged:
+            raise OSError("device reports readiness to read but returned no data")
+
+    @property
+    def dtr(self):
+        return self._dtr
+
+    @dtr.setter
+    def dtr(self, level):
+        if level and not self._dtr:
+            self.reset()
+        self._dtr = level
+
+    def open(self):
+        self.is_open = True
+
+    def close(self):
+        self.is_open = False
+
+    def count(self, table):
+        """How often a message was sent, and when first."""
+        identifier = protocol.message_id(table)
+        frames = [frame for _, data in self.written for frame in protocol.Parser().feed(data)]
+        return sum(protocol.message_id(type(frame.message)) == identifier for frame in frames)
+
+
+@pytest.fixture
+def port(new_board):
+    return VirtualPort(new_board)
+
+
+@pytest.fixture
+def rig(port):
+    return connect(port), port
+
+
+def connect(port):
+    return Board(port, "virtual", clock=port.clock, threaded=False)
+
+
+ROBOT = robot.load("pneumatic-3")
+HALF = np.full(6, 0.2)
+
+
+def changed(old, new):
+    text = robot.text_of("pneumatic-3")
+    assert old in text
+    return robot.parse(text.replace(old, new, 1))
+
+
+def run(board, port, seconds, pressures=HALF, first_tick=1, hz=2.5):
+    """A control loop that does its duty; returns the next tick."""
+    for tick in range(first_tick, first_tick + round(seconds * hz)):
+        board.set_pressures(tick, pressures)
+        until = port.clock() + 1 / hz
+        while port.clock() < until:
+            board._pump()
+    return first_tick + round(seconds * hz)
+
+
+def test_whole_run(rig):
+    board, port = rig
+    assert port.board.state == State.IDLE
+    board.arm(ROBOT)
+    assert port.board.state == State.ARMED
+    assert not any(port.board.counts)
+    run(board, port, 20)
+    assert port.board.state == State.RUNNING
+    assert port.board.applied == [2000] * 6 + [0] * 6
+    np.testing.assert_allclose(board.applied_bar[:6], 0.2)
+    np.testing.assert_allclose(board.measured_bar[:6], 0.2)
+    assert np.all(np.isnan(board.measured_bar[6:]))
+    assert 0 < board.ack_latency_s <= 0.006
+    assert board.vent()
+    assert not any(port.board.counts)
+    assert board.close()
+    assert not port.is_open
+    assert port.board.state == State.IDLE
+    assert port.board.faults == 0
+    statistics = board.statistics
+    assert (statistics["sets"], statistics["missed_acks"], statistics["refused"], statistics["bad_frames"]) == (
+        (50, 0, 0, 0)
+    )
+
+
+def test_nothing_is_sent_before_hello(port):
+    board = connect(port)
+    assert (port.talked_to_bootloader, port.resets) == (0, 0)
+    run_pumps(board, 1)
+    assert min(at for at, _ in port.written) >= BOOT_MS
+
+
+def run_pumps(board, times):
+    for _ in range(times):
+        board._pump()
+
+
+def test_silent_port_is_reset_three_times_then_given_up(new_board):
+    port = VirtualPort(new_board, firmware=False)
+    with pytest.raises(DeviceAbsent, match="not a byte came"):
+        connect(port)
+    assert port.resets == 3
+    assert port.written == []
+    assert port.now_ms < 13_000
+    assert not port.is_open
+
+
+def test_first_hello_lost_then_reset(port):
+    port.mute = True
+    original = port.reset
+
+    def reset():
+        original()
+        port.mute = False
+
+    port.reset = reset
+    board = connect(port)
+    assert (port.resets, board.hello.boot_id, port.talked_to_bootloader) == (1, 2, 0)
+
+
+def test_board_that_does_not_reset_on_opening_is_asked(new_board):
+    port = VirtualPort(new_board, reset_on_open=False)
+    port.run(10_000)
+    port.pending = b""
+    board = connect(port)
+    assert board.hello.boot_id == 1
+    assert port.resets == 0
+    assert port.count(protocol.HelloReq) == 1
+    board.arm(ROBOT)
+
+
+def test_foreign_protocol_is_refused(new_board, monkeypatch):
+    port = VirtualPort(new_board)
+    monkeypatch.setattr("modsoft.runtime.link.PROTOCOL_HASH", 0x1234)
+    with pytest.raises(ProtocolMismatch, match="flash the firmware of this version"):
+        connect(port)
+    assert port.written == []
+
+
+def test_line_noise_instead_of_frames(new_board):
+    port = VirtualPort(new_board, firmware=False)
+    port.pending = bytes(range(256)) * 4
+    with pytest.raises(DeviceAbsent, match="wrong baud rate"):
+        connect(port)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("full_scale_bar = 3.0", "full_scale_bar = 10.0", "valve full scale: .* has 3 bar, the robot file 10"),
+        ("p_min_bar = 0.08", "p_min_bar = 0.1", "smallest pressure"),
+        ("p_max_bar = 0.35", "p_max_bar = 0.3", "largest pressure"),
+        ("slew_bar_per_s = 2.0", "slew_bar_per_s = 1.0", "at 2 bar/s, the robot file allows 1"),
+        ("channel = 5", "channel = 11", "channel 11, the board at virtual has channels 0 to 10"),
+    ],
+)
+def test_board_that_does_not_fit_the_robot_file_is_never_armed(rig, old, new, complaint):
+    board, port = rig
+    with pytest.raises(ProtocolMismatch, match=complaint):
+        board.arm(changed(old, new))
+    assert port.count(protocol.Arm) == 0
+    assert port.board.state == State.IDLE
+
+
+def test_cable_robot_has_nothing_to_arm(rig):
+    with pytest.raises(RobotFileError, match="no valves"):
+        rig[0].arm(robot.load("cable-4"))
+
+
+def test_lost_frames_are_survived(rig):
+    """Every request is repeated; a set-point is not, the next one wins."""
+    board, port = rig
+    original = port.write
+    seen = []
+
+    def write(data):
+        seen.append(data)
+        if len(seen) % 3 != 0:
+            original(data)
+
+    port.write = write
+    board.arm(ROBOT)
+    tick = run(board, port, 10)
+    assert port.board.state == State.RUNNING
+    port.write = original
+    run(board, port, 2, first_tick=tick)
+    assert board.vent()
+
+
+def test_lost_answers_to_arm_are_survived(rig):
+    board, port = rig
+    original = port.step
+    dropped = []
+
+    def step():
+        original()
+        if port.board.state == State.ARMED and len(dropped) < 1 and port.pending:
+            dropped.append(port.pending)
+            port.pending = b""
+
+    port.step = step
+    board.arm(ROBOT)
+    assert port.board.state == State.ARMED
+    assert board.statistics["refused"] == 0
+    run(board, port, 1)
+    assert port.board.state == State.RUNNING
+
+
+def test_host_killed(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 2, pressures=np.full(6, 0.35))
+    last_written = port.written[-1][0]
+    while any(port.board.counts):
+        port.step()
+    assert port.now_ms - last_written <= 670
+    assert port.board.faults == Fault.LINK_TIMEOUT
+
+
+def test_stopped_host_comes_back_to_a_latched_fault(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    tick = run(board, port, 2)
+    port.run(5000)
+    run_pumps(board, 5)
+    with pytest.raises((Tripped, LostInRun)):
+        board.set_pressures(tick, HALF)
+    assert port.board.state == State.FAULT
+    assert not any(port.board.counts)
+
+
+def test_stuck_control_loop_is_noticed_by_the_board(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 2)
+    stuck_at = port.now_ms
+    while any(port.board.counts):
+        board._pump()  # the I/O thread lives on
+    assert port.now_ms - stuck_at <= 1400
+    assert port.board.faults == Fault.CONTROL_TIMEOUT
+    run_pumps(board, 40)
+    with pytest.raises(Tripped, match="CONTROL_TIMEOUT"):
+        board.check()
+    assert board.vent()
+
+
+def test_loop_that_holds_keeps_the_board_running(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    tick = run(board, port, 1)
+    for _ in range(10):
+        tick += 1
+        board.beat(tick)
+        run_pumps(board, 80)
+    assert port.board.state == State.RUNNING
+
+
+def test_cable_pulled(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    tick = run(board, port, 2)
+    port.unplugged = True
+    board._pump()
+    with pytest.raises(LostInRun, match="the port failed"):
+        board.set_pressures(tick, HALF)
+    assert board.vent() is False
+
+
+def test_deaf_board_vents_and_says_so(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 2)
+    port.deaf = True
+    with pytest.raises(LostInRun):
+        run(board, port, 4, first_tick=100)
+    assert board.vent()  # by its own timer, and it still said so
+    assert port.board.faults == Fault.LINK_TIMEOUT
+
+
+def test_three_lost_set_points_are_a_loss_and_then_silence(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    tick = run(board, port, 2)
+    original = port.write
+    port.write = lambda data: None if len(data) > 20 else original(data)  # heartbeats pass, set-points do not
+    with pytest.raises(LostInRun, match="3 set-points in a row were not acknowledged"):
+        run(board, port, 4, first_tick=tick)
+    port.write = original
+    silent_from = len(port.written)
+    assert board.vent()
+    assert len(port.written) == silent_from
+
+
+def test_refused_set_points_are_a_loss(rig):
+    board, port = rig
+    board.arm(changed("channel = 5", "channel = 6"))
+    with pytest.raises(LostInRun, match=r"not acknowledged \(refused: range\)"):
+        run(board, port, 4)  # channel 5 belongs to nobody
+    assert board.vent()
+
+
+def test_mute_board_is_lost(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 2)
+    port.mute = True
+    muted_at = port.now_ms
+    while board.lost is None:
+        board._pump()
+    assert "no word from the board" in board.lost
+    assert port.now_ms - muted_at <= 460
+    assert board.vent() is False  # it did vent, but it could not say so
+    assert not any(port.board.counts)
+
+
+def test_board_reset_in_mid_run(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 2)
+    port.reset()
+    reset_at, sent = port.now_ms, len(port.written)
+    while board.lost is None:
+        board._pump()
+    assert port.now_ms - reset_at <= 1200
+    talked = port.written[sent:]
+    assert all(protocol.message_id(protocol.Set) not in data[2:3] for _, data in talked)
+    sent = len(port.written)
+    assert board.vent()
+    assert len(port.written) == sent
+    assert port.now_ms - reset_at <= 6000
+    assert port.board.state == State.IDLE
+
+
+def test_restart_between_two_looks_is_seen_by_the_boot_id(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 1)
+    port.reset()
+    port.boots_at = port.now_ms + 50
+    run_pumps(board, 100)
+    assert "restarted by itself" in board.lost
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -0.01, 0.3501])
+def test_no_wild_set_point_is_sent(rig, bad):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 1)
+    sets = port.count(protocol.Set)
+    with pytest.raises(Tripped):
+        board.set_pressures(99, [0.1, bad])
+    run_pumps(board, 5)
+    assert port.count(protocol.Set) == sets
+
+
+def test_set_pressures_takes_a_row(rig):
+    board, _ = rig
+    board.arm(ROBOT)
+    with pytest.raises(ValueError, match="shape"):
+        board.set_pressures(1, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="shape"):
+        board.set_pressures(1, np.zeros(13))
+
+
+def test_newest_set_point_wins_and_none_is_sent_twice(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    board.set_pressures(1, np.full(6, 0.1))
+    assert board.set_pressures(2, np.full(6, 0.2)) == 2
+    run_pumps(board, 10)
+    assert port.count(protocol.Set) == 1
+    assert board.status.acked_seq == 2
+
+
+def test_over_pressure_trips_the_host(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    tick = run(board, port, 1)
+    port.follows = False
+    port.board.measured[2] = 8000
+    with pytest.raises(Tripped, match="OVER_PRESSURE"):
+        run(board, port, 2, first_tick=tick)
+    assert not any(port.board.counts)
+    assert board.clear_fault() is False
+    port.board.measured[:6] = [0] * 6
+    port.run(2)
+    assert board.clear_fault() is True
+    board.arm(ROBOT)
+    run(board, port, 1, first_tick=100)
+    assert port.board.state == State.RUNNING
+
+
+@pytest.mark.parametrize("mode", list(VentMode))
+def test_vent_is_said_only_after_the_board_said_it(rig, mode):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 2, pressures=np.full(6, 0.35))
+    started = port.now_ms
+    assert board.vent(mode)
+    assert not any(port.board.counts)
+    took = port.now_ms - started
+    assert (took <= 20) if mode is VentMode.DUMP else (175 <= took <= 300)
+
+
+def test_vent_gives_up_honestly_when_the_valves_stay_open(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 1)
+    port.deaf = True
+    assert board.vent(timeout_s=0.2) is False
+
+
+def test_context_manager_vents_on_an_exception(port):
+    def fail():
+        with connect(port) as board:
+            board.arm(ROBOT)
+            run(board, port, 1)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert not any(port.board.counts)
+    assert port.board.faults == 0
+    assert not port.is_open
