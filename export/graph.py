@@ -7,6 +7,8 @@ whole robot is one run. (Tracing torch freezes the number of modules at the trac
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import onnx
 from numpy.typing import NDArray
@@ -71,7 +73,7 @@ def build(weights: Weights, layers: int, description: str) -> onnx.ModelProto:
     constants: dict[str, NDArray] = dict(initializers(weights, layers))
     nodes: list[onnx.NodeProto] = []
 
-    def add(op: str, inputs: list[str], outputs: str | list[str], **attributes: object) -> str:
+    def add(op: str, inputs: list[str], outputs: str | list[str], **attributes: Any) -> str:
         outputs = [outputs] if isinstance(outputs, str) else outputs
         nodes.append(helper.make_node(op, inputs, outputs, name=f"{op}:{outputs[0]}", **attributes))
         return outputs[0]

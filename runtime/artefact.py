@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from modsoft.runtime.errors import ModelError
 
-SCHEMA = 1
+SCHEMA: Literal[1] = 1
 METADATA_KEY = "modsoft"
 OPSET = 18
 IR_VERSION = 8
@@ -39,7 +39,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """A part of the description: every key is known, nothing changes after reading."""
 
 
-class Network(Record):
+class Network(Record, frozen=True):
     """The sizes of the network of Table S1."""
 
     name: Literal["bilstm"]
@@ -50,14 +50,14 @@ class Network(Record):
     history: Size  # T, time steps
 
 
-class Golden(Record):
+class Golden(Record, frozen=True):
     """A pair that the runtime replays at start: features (N, F) and the actuation (N, A) that torch gives for them."""
 
     features: list[list[float]]
     actuation: list[list[float]]
 
 
-class Description(Record):
+class Description(Record, frozen=True):
     """What the model is, whom it fits and where it comes from."""
 
     schema: Literal[1]
