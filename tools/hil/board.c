@@ -25,7 +25,8 @@
  *   watchdog, reset (cause: power-on, external, watchdog), hang, halted
  *   late       emulated time gave way by late_us
  *   command    line, done: the echo of every command but `adc`
- *   stats, summary   times, lateness, share of a core, byte counters
+ *   stats, summary   times, lateness, share of a core, byte counters; firmware_slept_us and firmware_max_awake_us: how much
+ *              the firmware slept since the last reset, and its longest time without (its worst loop)
  *
  * Known differences from the chip: a new compare value shows at once, not at the end of the PWM period (256 us); a pin
  * whose timer is connected but stopped counts as 0; ADC8..15 are not there; sleep takes no time to wake from.
@@ -40,75 +41,85 @@
 
 #include "avr_adc.h"
 #include "avr_extint.h"
+#include "avr_watchdog.h"
 #include "sim_elf.h"
 #include "sim_hex.h"
 
 #define RJMP_SELF 0xCFFF /* rjmp .-2 */
 
 const char *const board_name = "simavr";
+struct board_load board_load;
 
 avr_t *avr;
 
+static const char *reset_cause;
+static ticks_t held_until; /* in reset; 0: running */
+static bool chip_was_reset, halted_reported;
 static void (*chip_reset)(avr_t *);
-static const char *reset_cause = "watchdog"; /* unless somebody outside the chip set it */
-static bool was_reset, halted_reported;
+static ticks_t woken; /* end of the last sleep; 0 before the first */
 static struct { uint32_t at; uint8_t before[2]; bool on; } hang;
 
 /* --- reset and power --------------------------------------------------------------------------------------------- */
 
 static void on_chip_reset(avr_t *chip)
 {
-    was_reset = true;
+    chip_was_reset = true;
     if (chip_reset)
         chip_reset(chip);
 }
 
-static void after_reset(void)
+/* The registers are cleared, so the pins float: a valve is off from here on. The chip stays in reset for a while. */
+static void enter_reset(const char *cause)
 {
-    was_reset = halted_reported = false;
+    reset_cause = cause;
+    held_until = avr->cycle + STARTUP_TICKS;
     if (hang.on) {
         memcpy(avr->flash + hang.at, hang.before, 2);
         hang.on = false;
     }
-    for (int i = 0; i < EXTINT_COUNT; i++)
-        avr_extint_set_strict_lvl_trig(avr, i, 0); /* else the low pins are polled in every cycle: 0.35x real time */
-    avr->run_cycle_limit = TICKS_PER_SECOND / 1000; /* run on until the next timer instead of one instruction a call */
-    uart_after_reset();
+    report_reset(cause);
+    outputs_sample();
+}
+
+static void leave_reset(void)
+{
+    for (avr_io_t *io = avr->io_port; io; io = io->next)
+        if (!strcmp(io->kind, "watchdog") && !strcmp(reset_cause, "watchdog")) {
+            avr_watchdog_t *watchdog = (avr_watchdog_t *)io; /* it stays armed over the reset it caused */
+            watchdog->reset_context.wdrf = 1;
+            watchdog->reset_context.avr_run = avr->run;
+        }
+    avr_reset(avr);
     if (!strcmp(reset_cause, "external"))
         avr->data[MCUSR] |= 1 << EXTRF;
     else if (!strcmp(reset_cause, "power-on"))
         avr->data[MCUSR] |= 1 << PORF;
-    report_reset(reset_cause);
-    reset_cause = "watchdog";
-    outputs_sample();
+    for (int i = 0; i < EXTINT_COUNT; i++)
+        avr_extint_set_strict_lvl_trig(avr, i, 0); /* else the low pins are polled in every cycle: 0.35x real time */
+    avr->run_cycle_limit = TICKS_PER_SECOND / 1000; /* run on until the next timer instead of one instruction a call */
+    uart_after_reset();
+    held_until = woken = board_load.slept = 0;
+    chip_was_reset = halted_reported = false;
 }
 
 void board_reset_pin(void)
 {
-    reset_cause = "external";
     avr_reset(avr);
-    after_reset();
-}
-
-/* Static RAM and the working registers hold chance values at power-on; every other reset leaves them alone. */
-static void forget_ram(void)
-{
-    for (unsigned address = 0; address <= avr->ramend; address++)
-        if (address < 32 || address > avr->ioend)
-            avr->data[address] = random_u32();
+    enter_reset("external");
 }
 
 void board_power_cycle(void)
 {
-    reset_cause = "power-on";
     avr_reset(avr);
-    forget_ram();
-    after_reset();
+    for (unsigned address = 0; address <= avr->ramend; address++) /* chance values; every other reset leaves them alone */
+        if (address < 32 || address > avr->ioend)
+            avr->data[address] = random_u32();
+    enter_reset("power-on");
 }
 
 bool board_hang(void)
 {
-    if (hang.on || (avr->reset_pc && avr->pc >= avr->reset_pc))
+    if (hang.on || held_until || (avr->reset_pc && avr->pc >= avr->reset_pc))
         return false; /* the bootloader has no watchdog */
     hang.at = avr->pc;
     hang.on = true;
@@ -127,14 +138,19 @@ static avr_cycle_count_t on_slice_end(avr_t *chip, avr_cycle_count_t when, void 
 
 void board_run(ticks_t until)
 {
+    if (held_until) {
+        avr->cycle = held_until < until ? held_until : until;
+        uart_ignore_bytes();
+        if (avr->cycle < held_until)
+            return;
+        leave_reset();
+    }
     uart_start_byte();
-    avr_cycle_timer_register(avr, until - avr->cycle, on_slice_end, NULL);
-    while (avr->cycle < until) {
+    avr_cycle_timer_register(avr, until > avr->cycle ? until - avr->cycle : 1, on_slice_end, NULL);
+    while (avr->cycle < until && !held_until) {
         avr->run(avr);
-        if (was_reset) { /* by the watchdog */
-            after_reset();
-            avr_cycle_timer_register(avr, until > avr->cycle ? until - avr->cycle : 1, on_slice_end, NULL);
-        }
+        if (chip_was_reset)
+            enter_reset("watchdog");
         if (avr->state == cpu_Done || avr->state == cpu_Crashed) { /* asleep with interrupts off, or lost: time goes on */
             if (!halted_reported)
                 event("halted", "\"pc\":%u,\"crashed\":%s", (unsigned)avr->pc, avr->state == cpu_Crashed ? "true" : "false");
@@ -186,9 +202,14 @@ static void log_to_stderr(avr_t *chip, const int level, const char *format, va_l
         vfprintf(stderr, format, arguments);
 }
 
-static void do_not_sleep(avr_t *chip, avr_cycle_count_t cycles)
+/* The firmware sleeps until the next timer of the emulated chip; real time passes elsewhere, slice by slice. */
+static void on_sleep(avr_t *chip, avr_cycle_count_t cycles)
 {
-    (void)chip, (void)cycles; /* the harness holds the pace, slice by slice */
+    ticks_t awake = chip->cycle - woken;
+    if (woken && awake > board_load.max_awake)
+        board_load.max_awake = awake;
+    board_load.slept += cycles + 1;
+    woken = chip->cycle + cycles + 1;
 }
 
 void board_power_on(const struct options *options)
@@ -202,7 +223,7 @@ void board_power_on(const struct options *options)
     avr_init(avr);
     avr->frequency = TICKS_PER_SECOND;
     avr->vcc = avr->avcc = avr->aref = 5000;
-    avr->sleep = do_not_sleep;
+    avr->sleep = on_sleep;
     chip_reset = avr->reset;
     avr->reset = on_chip_reset;
     load_firmware(options->firmware);

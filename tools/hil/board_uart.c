@@ -9,7 +9,7 @@
 
 static avr_uart_t *uart;
 static avr_irq_t *uart_in;
-static ticks_t tx_free;                /* when the shift register will be empty */
+static ticks_t tx_free, rx_end;        /* when the last byte is out; when the one arriving is in */
 static int rx_now = -1, rx_shift = -1; /* arriving; arrived, but both places of the receive buffer are taken */
 static struct { avr_io_read_t read; void *param; } chip_udr;
 static struct { avr_io_write_t write; void *param; } chip_ucsrb;
@@ -22,6 +22,12 @@ static uint32_t board_bit_ticks(void)
 static uint32_t board_baud(void)
 {
     return TICKS_PER_SECOND / board_bit_ticks();
+}
+
+/* 0 while the receiver is off: then it does not matter how fast the host sends. */
+static uint32_t listening_baud(void)
+{
+    return avr->data[UCSR0B] >> RXEN0 & 1 ? board_baud() : 0;
 }
 
 /* simavr works its byte time out at every change of the rate, so this is done before it is used. */
@@ -52,14 +58,15 @@ static avr_cycle_count_t on_rx_byte(avr_t *chip, avr_cycle_count_t when, void *p
         else
             rx_shift = rx_now;
     }
-    rx_now = line_next_byte(board_baud());
+    rx_now = line_next_byte(listening_baud());
     if (rx_now < 0)
         return 0;
+    rx_end = when + line_byte_ticks();
     if (rx_shift >= 0) { /* a new start bit, and the shift register is still taken */
         line_counters.rx_overrun++;
         rx_shift = -1;
     }
-    return when + line_byte_ticks();
+    return rx_end;
 }
 
 static uint8_t on_udr_read(avr_t *chip, avr_io_addr_t address, void *param)
@@ -107,15 +114,23 @@ void uart_after_reset(void)
 {
     avr->data[UCSR0B] = 0; /* simavr leaves the transmitter on */
     tx_free = 0;
-    rx_shift = -1;
-    if (rx_now >= 0) /* the reset dropped the timer; the byte on the wire still comes */
-        avr_cycle_timer_register(avr, line_byte_ticks(), on_rx_byte, NULL);
+    rx_now = rx_shift = -1;
 }
 
 void uart_start_byte(void)
 {
-    if (rx_now < 0 && (rx_now = line_next_byte(board_baud())) >= 0)
+    if (rx_now >= 0)
+        return;
+    rx_now = line_next_byte(listening_baud());
+    rx_end = avr->cycle + (rx_now < 0 ? 0 : line_byte_ticks());
+    if (rx_now >= 0)
         avr_cycle_timer_register(avr, line_byte_ticks(), on_rx_byte, NULL);
+}
+
+void uart_ignore_bytes(void)
+{
+    while (rx_end <= avr->cycle)
+        rx_end = line_next_byte(0) < 0 ? avr->cycle + 1 : rx_end + line_byte_ticks();
 }
 
 void uart_begin(void)

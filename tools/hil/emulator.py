@@ -68,9 +68,8 @@ STOP_TIMEOUT_S = 3.0
 
 def missing_packages(board: BoardName) -> list[str]:
     """Return the Debian packages that `board` still needs on this machine, in the order of `DEBIAN_PACKAGES`."""
-    return [
-        DEBIAN_PACKAGES[need] for need in _NEEDS[board] if not (Path(need).exists() or shutil.which(need) is not None)
-    ]
+    there = {need: Path(need).exists() if need.startswith("/") else bool(shutil.which(need)) for need in _NEEDS[board]}
+    return [DEBIAN_PACKAGES[need] for need, found in there.items() if not found]
 
 
 def choose(board: str = "auto") -> BoardName:

@@ -15,6 +15,9 @@
 #define TICKS_PER_SECOND (1000000u * TICKS_PER_US)
 typedef uint64_t ticks_t;
 
+/* The MEGA's fuses hold the chip for 16K clocks and 65 ms after every reset. */
+#define STARTUP_TICKS (16384 + 65000 * TICKS_PER_US)
+
 #define ADC_CHANNELS 8
 #define MAX_CHANNELS 16
 
@@ -29,6 +32,12 @@ struct options {
 
 extern const char *const board_name;
 extern const unsigned board_channels;
+
+struct board_load {
+    ticks_t slept;     /* since the last reset, the firmware's own sleep */
+    ticks_t max_awake; /* longest stretch from one sleep to the next: the firmware's worst loop; 0 where not emulated */
+};
+extern struct board_load board_load;
 
 void board_power_on(const struct options *options);
 ticks_t board_now(void);
@@ -56,7 +65,7 @@ void line_plug(const char *link);
 const char *line_port(void);
 void line_poll(void);                             /* once a slice: opened or closed, bytes in */
 void line_flush(ticks_t now);                     /* once a slice: bytes out whose stop bit has passed */
-int line_next_byte(uint32_t board_baud);          /* the byte that starts to arrive now, or -1 */
+int line_next_byte(uint32_t board_baud);          /* the byte that starts to arrive now, or -1; 0: nobody listens */
 ticks_t line_byte_ticks(void);                    /* how long it takes to arrive, at the host's rate */
 void line_send(ticks_t end, uint8_t byte, uint32_t board_baud);
 bool line_command(const char *verb, double probability);

@@ -157,7 +157,7 @@ ticks_t line_byte_ticks(void)
 static bool rates_differ(uint32_t board_baud)
 {
     double difference = (double)host_baud - board_baud;
-    if ((difference < 0 ? -difference : difference) <= BAUD_TOLERANCE * board_baud)
+    if (!board_baud || (difference < 0 ? -difference : difference) <= BAUD_TOLERANCE * board_baud)
         return false;
     if (!wrong_baud_reported)
         event("wrong-baud", "\"host\":%u,\"board\":%u", host_baud, board_baud);

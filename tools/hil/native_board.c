@@ -19,6 +19,7 @@
 
 const char *const board_name = "native";
 const unsigned board_channels = CHANNELS_USED;
+struct board_load board_load;
 
 static struct controller logic;
 static ticks_t now, next_loop, started, watchdog_fed, tx_free, rx_end;
@@ -36,7 +37,7 @@ static uint32_t now_ms(void)
 static void start(uint8_t cause, const char *name)
 {
     hung = false;
-    started = next_loop = watchdog_fed = now;
+    started = next_loop = watchdog_fed = now + STARTUP_TICKS;
     tx_free = 0;
     report_reset(name);
     controller_init(&logic, boot_id, cause, 0);
@@ -80,12 +81,12 @@ void board_run(ticks_t until)
         if (watchdog < next)
             next = watchdog;
         now = next > now ? next : now;
-        bool arrived = rx_now >= 0 && now >= rx_end;
-        if (arrived && !hung)
+        bool arrived = rx_now >= 0 && now >= rx_end, listens = !hung && now >= started;
+        if (arrived && listens)
             controller_receive(&logic, (uint8_t)rx_now, now_ms());
         if (arrived)
             rx_now = -1;
-        if (!hung && (arrived || now >= next_loop)) {
+        if (listens && (arrived || now >= next_loop)) {
             loop();
             next_loop = now + LOOP_TICKS;
         }
