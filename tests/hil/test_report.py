@@ -36,6 +36,7 @@ def record():
         faults=np.zeros(ticks, dtype=np.int64),
         state=["RUNNING"] * ticks,
         end_ns=ticks * 400_000_000,
+        said_vented=True,
         valves=Valves(np.array([0]), np.zeros((1, 12)), 4096),
         board_events=[],
         board_dropped_bytes=0,

@@ -75,6 +75,7 @@ class Record:
     faults: NDArray[np.int64]  # (K,)
     state: list[str]  # (K,) the board's
     end_ns: int  # the vent begins: outputs no longer follow the last tick
+    said_vented: bool  # the runtime, on the board's word
     valves: Valves
     board_events: list[dict[str, Any]]  # resets and watchdog, all of the emulator's life
     board_dropped_bytes: float  # by the board's receiver; NaN where it did not say
@@ -83,7 +84,7 @@ class Record:
     plant_mono_ns: NDArray[np.int64]  # (M,)
     plant_configuration: Array  # (M, N, 3)
     plant_bar: Array  # (M, N, 2)
-    plant_late_ms: Array  # (M,)
+    plant_late_ms: Array  # of the slices in the run
 
 
 class Acceptance(NamedTuple):
@@ -138,9 +139,12 @@ def valve_difference(record: Record) -> Array:
     """Largest difference (K,) of timer registers from what the log says was commanded, in counts, over all channels
     and all the time from when the slew must have settled until the next tick starts. NaN: no such time."""
     scale = record.valves.counts / record.robot.valve.full_scale_bar
+    channels = record.valves.duty.shape[1]
+    if record.commanded_bar[:, channels:].any():
+        return np.full(len(record.tick), np.inf)  # a set-point for a channel that the board does not have
     worst = np.full(len(record.tick), np.nan)
-    before = np.zeros(record.commanded_bar.shape[1])
-    for k, commanded in enumerate(record.commanded_bar):
+    before = np.zeros(channels)
+    for k, commanded in enumerate(record.commanded_bar[:, :channels]):
         slew_s = np.max(np.abs(commanded - before)) / record.robot.limits.slew_bar_per_s
         acknowledged_s = np.nan_to_num(record.acknowledged_ms[k], nan=ACKNOWLEDGED_P99_MS) * 1e-3
         settled_ns = record.mono_ns[k] + round((acknowledged_s + slew_s + SETTLING_S) * 1e9)
@@ -203,6 +207,9 @@ def acceptances(record: Record) -> list[Acceptance]:
         at_most("resets in the run", sum(event["event"] == "reset" for event in running), 0),
         at_most("watchdog resets", watchdogs, 0),
         at_most("bytes dropped by the board's receiver", record.board_dropped_bytes, DROPPED_BYTES),
+        Acceptance(
+            "the board's word that it vented", "yes" if record.said_vented else "no", "yes", record.said_vented
+        ),
         at_most("largest duty at the end", float(np.max(record.valves.duty[-1], initial=0.0))
                 if len(record.valves.duty) else math.nan, 0.0),
         at_most("highest chamber pressure at the end", float(np.max(record.plant_bar[-1]))

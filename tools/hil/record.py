@@ -11,11 +11,93 @@ import msgspec
 import numpy as np
 
 from modsoft.hil.emulator import FIRMWARE, FIRMWARE_ELF
-from modsoft.hil.judge import Valves
+from modsoft.hil.judge import Record, Valves
+from modsoft.runtime import log
+from modsoft.runtime.robot import Robot
 
 Line = dict[str, Any]
 
 LATE_BOUND_MS = 20.0  # board.c: emulated time never falls further behind, it gives way and says `late`
+
+
+def read(folder: Path, run: Path | None, robot: Robot, task: str, steps: int, runtime_exit: int) -> Record:
+    """The record of a run from the rig's `folder` and from the runtime's own, `run` (None: it never made one)."""
+    events = lines(folder / "board.jsonl")
+    plant = lines(folder / "plant.jsonl")
+    ticks, told = [], []
+    if run is not None:
+        _, ticks, told = log.read(run)
+    end = next((event for event in told if event["event"] == "end"), None)
+    start_ns = ticks[0]["mono_ns"] if ticks else math.inf
+    end_ns = end["mono_ns"] if end else ticks[-1]["mono_ns"] if ticks else -1
+    summary = next((event for event in events if event["event"] == "summary"), {})
+    count, modules = len(ticks), robot.modules
+    said = (folder / "runtime.err").read_text(errors="replace").strip().splitlines()
+    return Record(
+        robot=robot,
+        task=task,
+        steps=steps,
+        runtime_exit=runtime_exit,
+        runtime_said=said[-1] if said else "",
+        tick=_column(ticks, "tick", np.int64),
+        mono_ns=_column(ticks, "mono_ns", np.int64),
+        lateness_ms=_column(ticks, "late_ms"),
+        missed=sum(tick["missed"] + (not tick["sent"]) for tick in ticks),
+        held=sum(tick["verdict"] != "good" for tick in ticks),
+        desired=_column(ticks, "desired").reshape(count, modules, 3),
+        configuration=np.array(
+            [tick["configuration"] or np.full((modules, 3), np.nan) for tick in ticks], dtype=np.float64
+        ).reshape(count, modules, 3),
+        frame_mono_ns=np.array([tick["frame"]["mono_ns"] if tick["frame"] else -1 for tick in ticks], dtype=np.int64),
+        commanded_bar=_commanded(ticks),
+        acknowledged_ms=np.array([_number(tick["acknowledged"]["ms"]) for tick in ticks]),
+        faults=np.array([tick["board"]["faults"] if tick["board"] else 0 for tick in ticks], dtype=np.int64),
+        state=[tick["board"]["state"] if tick["board"] else "unknown" for tick in ticks],
+        end_ns=end_ns,
+        said_vented=bool(end and end["vented"]),
+        valves=valves(events),
+        board_events=[event for event in events if event["event"] in ("reset", "watchdog")],
+        board_dropped_bytes=summary.get("rx_overrun", math.nan),
+        board_late_ms=_board_late_ms(events, summary, start_ns, end_ns),
+        board_summary=summary,
+        **_plant(plant, modules, start_ns, end_ns),
+    )
+
+
+def _column(ticks: list[Line], name: str, kind: Any = np.float64) -> np.ndarray:
+    return np.array([tick[name] for tick in ticks], dtype=kind)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _commanded(ticks: list[Line]) -> np.ndarray:
+    """Set-points (K, channels) in force after each tick: those of the tick before where nothing was sent."""
+    rows: list[list[float]] = []
+    for tick in ticks:
+        rows.append(tick["commanded_bar"] or rows[-1])
+    return np.array(rows, dtype=np.float64).reshape(len(ticks), -1 if rows else 0)
+
+
+def _board_late_ms(events: list[Line], summary: Line, start_ns: float, end_ns: int) -> float:
+    """Largest lateness of the emulated board in the run, NaN where it gave no summary. It says `late` whenever the
+    bound is passed; without that it was within the bound, or within its largest lateness ever."""
+    late = [event["late_us"] * 1e-3 for event in events if event["event"] == "late"
+            and start_ns <= event["mono_ns"] <= end_ns]  # fmt: skip
+    ever_ms = summary.get("max_late_us", math.nan) * 1e-3
+    return max(late) if late else min(LATE_BOUND_MS, ever_ms) if ever_ms >= 0 else math.nan
+
+
+def _plant(states: list[Line], modules: int, start_ns: float, end_ns: int) -> Line:
+    """The plant's columns of a record; its lateness only of the slices in the run."""
+    late = [state["late_ms"] for state in states if start_ns <= state["mono_ns"] <= end_ns]
+    return {
+        "plant_mono_ns": _column(states, "mono_ns", np.int64),
+        "plant_configuration": _column(states, "configuration").reshape(len(states), modules, 3),
+        "plant_bar": _column(states, "pressure_bar").reshape(len(states), modules, 2),
+        "plant_late_ms": np.array(late),
+    }
 
 
 def lines(path: Path) -> list[Line]:

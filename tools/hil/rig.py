@@ -213,7 +213,7 @@ class Rig:
     def ticks(self) -> int:
         """Ticks in the run log so far."""
         folder = self.run_folder()
-        return (folder / "run.jsonl").read_bytes().count(b"\n") if folder else 0
+        return (folder / "run.jsonl").read_bytes().count(b'\n{"tick"') if folder else 0
 
     def said(self) -> str:
         """The runtime's last line on standard error."""

@@ -1,0 +1,108 @@
+"""`modsoft-hil`: the unmodified runtime against the emulated board, the fake tracker and the simulated robot."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import signal
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+
+import click
+from tqdm import tqdm
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.command import entry
+from modsoft.runtime.controller import Controller
+from modsoft.runtime.trajectory import load_task
+
+RUN_SLACK_S = 60.0  # start, arming, venting and closing of the runtime, beyond its ticks
+AFTER_S = 1.5  # the trace goes on for so long, until the chambers are empty
+
+
+@click.command("modsoft-hil", context_settings={"show_default": True})
+@click.option("--robot", "robot_file", required=True, help="Robot file, or a shipped robot's name (pneumatic-3, ...).")
+@click.option("--model", required=True, type=click.Path(path_type=Path), help="Controller of modsoft-export.")
+@click.option("--task", required=True, help="Task's name (edge, down), or a .npy file of desired configurations.")
+@click.option("--report", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder to write.")
+@click.option("--board", default="auto", type=click.Choice(["auto", "simavr", "native"]),
+              help="simavr: the compiled firmware on an emulated ATmega2560. native: its logic compiled for this "
+                   "machine. auto: simavr where it can be had.")  # fmt: skip
+@click.option("--steps", type=click.IntRange(1), help="Run only so many control steps.  [default: the whole task]")
+def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps: int | None) -> int:
+    """Run a controller in real time on hardware that is not there, and judge the run.
+
+    \b
+    Example:
+      modsoft-hil --robot pneumatic-3 --model model.onnx --task down --report out
+
+    \b
+    Exit code:
+      0    every acceptance holds
+      1    one does not
+      3    not judged: the host was too slow, or the run shorter than 100 control steps
+    Others are those of modsoft-runtime (64 robot file, 65 model, 69 something is missing, ...).
+
+    The folder gets report.md, report.json, angles.png, run.jsonl (the runtime's log), board.jsonl (timer registers of
+    the emulated board) and plant.jsonl (the simulated robot). Nothing else should keep the processor busy meanwhile.
+    """
+    from modsoft.hil import judge, record  # after --help: matplotlib takes a second to import
+    from modsoft.hil import report as reports
+    from modsoft.hil.emulator import build, choose
+    from modsoft.hil.rig import Rig
+
+    robot = robots.load(robot_file)
+    desired = load_task(task, robot)
+    Controller.load(model).check(robot)  # the runtime does it too; here it saves the start of the rig
+    count = min(steps or len(desired), len(desired))
+    build(choose(board))
+
+    report.mkdir(parents=True, exist_ok=True)
+    options = [] if steps is None else ["--steps", str(steps)]
+    with _ended_in_order(), Rig(robot_file, report, board) as rig:
+        rig.run(model, task, *options)
+        with tqdm(total=count, unit=" ticks", desc="run", disable=not sys.stderr.isatty()) as bar:
+            rig.wait(count * robot.loop.period_s + RUN_SLACK_S, lambda ticks: bar.update(ticks - bar.n))
+        rig.settle(AFTER_S)
+    found = record.read(report, rig.run_folder(), rig.robot, task, count, rig.runtime.returncode)
+    verdict = judge.judge(found)
+    about = {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": f"modsoft-hil --robot {Path(robot_file).name} --model {model.name} --task {Path(task).name} "
+        f"--board {rig.board.board}" + (f" --steps {steps}" if steps else ""),
+        "board": record.board_in_words(rig.board.board),
+        "board's clock": rig.board.clock,
+        "firmware, SHA-256": record.firmware_sha256(rig.board.board),
+        "model, SHA-256": hashlib.sha256(model.read_bytes()).hexdigest(),
+        "robot": f"{robot.name}, {robot.modules} modules, {robot.loop.hz:g} Hz",
+        "task": f"{task}, {count} control steps",
+    }
+    reports.write(found, verdict, about, report)
+    for line in [*verdict.acceptances, *verdict.witnesses]:
+        click.echo(f"{'ok' if line.ok else 'NO':>4}  {line.name}: {line.found} ({line.limit})")
+    click.echo(f"{verdict}\n{report / 'report.md'}")
+    return verdict.exit_code
+
+
+@contextlib.contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """SIGTERM and SIGHUP leave through every `finally`, like Ctrl-C, with the exit code a shell expects."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        sys.exit(128 + number)
+
+    before = {number: signal.signal(number, leave) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+main = entry(cli)
+
+if __name__ == "__main__":
+    main()
