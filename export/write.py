@@ -37,6 +37,8 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
     out = model.with_suffix(".onnx") if out is None else Path(out)
     if not out.parent.is_dir() or out.is_dir():
         raise UsageError(f"--out {out}: expected a file in a folder that is there")
+    if out.resolve() == model.resolve():
+        raise UsageError(f"--out {out}: that is the model to export; give it another name")
     checkpoint = source.read(model, None if meta is None else Path(meta))
     network = checkpoints.network_of(checkpoint)
     expected = parity.reference(network)

@@ -44,7 +44,11 @@ def read(path: Path) -> dict[str, Any]:
         raise ModelError(f"no model file {path}; modsoft-train --out {path} makes one")
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, EOFError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+    except pickle.UnpicklingError as error:  # torch's own message recommends loading it with code and all
+        raise ModelError(
+            f"{path}: not a checkpoint of modsoft-train (it holds other than tensors and plain values)"
+        ) from error
+    except (OSError, EOFError, RuntimeError, ValueError, KeyError, zipfile.BadZipFile) as error:
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise ModelError(f"{path}: not a checkpoint of modsoft-train ({first})") from error
     if not isinstance(checkpoint, dict):
