@@ -8,7 +8,7 @@
     provenance  {"data_sha256", "seed", "code_version", "date", "split", "samples", "iterations", "errors_percent", ...}
     resume      what training needs to go on (optimiser, random states); absent in a finished model
 
-It is read with `weights_only=True`: a model file from a stranger runs no code.
+It is read with `weights_only=True`, so that a file from a stranger runs no code, and only when every checksum holds.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import os
 import pickle
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from modsoft.training.networks import BiLSTM
 
 SCHEMA = 1
 KEYS = ("schema", "robot", "network", "features", "weights", "provenance")
+# What zipfile and torch raise for other files and for damaged ones.
+NOT_READABLE = (OSError, EOFError, RuntimeError, ValueError, LookupError, zipfile.BadZipFile, zlib.error)
 
 
 def save(checkpoint: dict[str, Any], path: Path) -> None:
@@ -43,14 +46,18 @@ def read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ModelError(f"no model file {path}; modsoft-train --out {path} makes one")
     try:
+        with zipfile.ZipFile(path) as archive:  # torch reads old formats too, and does not look at the checksums
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise ModelError(f"{path}: damaged: {damaged} in it fails its checksum; copy or train it again")
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:  # torch's own message recommends loading it with code and all
         raise ModelError(
             f"{path}: not a checkpoint of modsoft-train (it holds other than tensors and plain values)"
         ) from error
-    except (OSError, EOFError, RuntimeError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except NOT_READABLE as error:
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise ModelError(f"{path}: not a checkpoint of modsoft-train ({first})") from error
+        raise ModelError(f"{path}: not a checkpoint of modsoft-train, or damaged ({first})") from error
     if not isinstance(checkpoint, dict):
         raise ModelError(f"{path}: holds a {type(checkpoint).__name__}, expected a checkpoint of modsoft-train")
     return checkpoint

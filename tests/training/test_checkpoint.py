@@ -1,0 +1,50 @@
+"""A checkpoint file is read whole and sound, or refused in one line."""
+
+import random
+
+import pytest
+import torch
+
+from modsoft.runtime.errors import ModelError
+from modsoft.training import checkpoint as checkpoints
+
+
+def spoilt(sound, generator):
+    content = bytearray(sound)
+    at = generator.randrange(len(content))
+    match generator.randrange(4):
+        case 0:
+            content[at] ^= 1 << generator.randrange(8)
+        case 1:
+            content[at : at + 64] = bytes(len(content[at : at + 64]))
+        case 2:
+            del content[at:]
+        case 3:
+            del content[at]
+    return bytes(content)
+
+
+def test_a_damaged_file_never_gives_other_values(tmp_path, make_checkpoint):
+    """Refused, or, where the damage hit only the archive's padding, the same to the last bit."""
+    path = make_checkpoint(tmp_path / "model.pt")
+    sound, expected, generator, refused = path.read_bytes(), checkpoints.load(path), random.Random(0), 0
+    for _ in range(300):
+        path.write_bytes(spoilt(sound, generator))
+        try:
+            found = checkpoints.load(path)
+        except ModelError as error:
+            assert "\n" not in str(error)
+            refused += 1
+            continue
+        weights, wanted = found.pop("weights"), dict(expected["weights"])
+        assert found == {name: value for name, value in expected.items() if name != "weights"}
+        assert weights.keys() == wanted.keys()
+        assert all(torch.equal(weights[name], wanted[name]) for name in wanted)
+    assert refused > 250
+
+
+@pytest.mark.parametrize("content", [b"", b"j", b"jun", b"junk", b"PK\x03\x04", b"[robot]\n", bytes(600)])
+def test_other_files(tmp_path, content):
+    (tmp_path / "model.pt").write_bytes(content)
+    with pytest.raises(ModelError, match="not a checkpoint"):
+        checkpoints.load(tmp_path / "model.pt")
