@@ -32,8 +32,7 @@ def test_a_damaged_file_never_gives_other_values(tmp_path, make_checkpoint):
         path.write_bytes(spoilt(sound, generator))
         try:
             found = checkpoints.load(path)
-        except ModelError as error:
-            assert "\n" not in str(error)
+        except ModelError:
             refused += 1
             continue
         weights, wanted = found.pop("weights"), dict(expected["weights"])
@@ -46,5 +45,5 @@ def test_a_damaged_file_never_gives_other_values(tmp_path, make_checkpoint):
 @pytest.mark.parametrize("content", [b"", b"j", b"jun", b"junk", b"PK\x03\x04", b"[robot]\n", bytes(600)])
 def test_other_files(tmp_path, content):
     (tmp_path / "model.pt").write_bytes(content)
-    with pytest.raises(ModelError, match="not a checkpoint"):
+    with pytest.raises(ModelError, match=r"^[^\n]*not a checkpoint[^\n]*$"):
         checkpoints.load(tmp_path / "model.pt")
