@@ -114,6 +114,11 @@ def _run(command: tuple[str, ...], complaint: str) -> None:
         raise DeviceAbsent(f"{complaint}: {(lines or [result.stderr.strip()[-200:]])[0]}")
 
 
+def is_event(name: str, **values: Any) -> Callable[[Event], bool]:
+    """A predicate for `EmulatedBoard.wait_for`: events of this name with these values."""
+    return lambda event: event["event"] == name and all(event.get(key) == value for key, value in values.items())
+
+
 class EmulatedBoard:
     """An emulated MEGA in a process of its own, used as a context manager.
 
@@ -186,7 +191,7 @@ class EmulatedBoard:
         self._reader = threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True)
         self._reader.start()
         try:
-            self.ready = self.wait_for(lambda event: event["event"] == "ready", START_TIMEOUT_S)
+            self.ready = self.wait_for(is_event("ready"), START_TIMEOUT_S)
         except TimeoutError:
             self.stop()
             raise DeviceAbsent(f"the {self.board} board did not start: {self._complaint}") from None

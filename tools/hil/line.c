@@ -15,6 +15,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #define BITS_PER_BYTE 10   /* start, eight data, stop */
@@ -44,8 +45,10 @@ static bool chance(double probability)
 
 static void make_link(const char *link)
 {
+    struct stat there;
     snprintf(link_name, sizeof link_name, "%s", link);
-    unlink(link_name);
+    if (lstat(link_name, &there) == 0 && S_ISLNK(there.st_mode))
+        unlink(link_name); /* left behind by a board that was killed; anything else is not ours to remove */
     if (symlink(slave_name, link_name) != 0)
         fail(EXIT_USAGE, "cannot make the port link %s: %s", link_name, strerror(errno));
 }
