@@ -58,19 +58,20 @@ def test_host_killed_vents_all_valves(board_name: str, drive: Any) -> None:
         assert 200 < took_ms <= 670
 
 
-def test_firmware_that_hangs_is_stopped_by_the_watchdog(board_name: str, drive: Any) -> None:
+@pytest.mark.parametrize("command", ["hang", "hang cli"])
+def test_firmware_that_hangs_is_stopped_by_the_watchdog(board_name: str, command: str, drive: Any) -> None:
     with EmulatedBoard(board_name) as board:
         board.send("sensors 20")
         host = drive(board, *["0.35"] * 11)
         boot_id = host.until(state=3, applied=[3500] * 11 + [0])["boot_id"]
         since = len(board.trace)
-        board.send("hang")
+        board.send(command)
         hung = board.wait_for(is_event("hang"), 2, since)
         board.wait_for(is_event("reset", cause="watchdog"), 2, since)
         host.kill()
         time.sleep(0.2)
         took_ms = (zero_at_us(board.trace, since, 11) - hung["t_us"]) / 1000
-        print(f"{board_name}: all valves 0 {took_ms:.1f} ms after the firmware hung, emulated time")
+        print(f"{board_name}: all valves 0 {took_ms:.1f} ms after the firmware hung ({command}), emulated time")
         assert took_ms <= 130
         assert drive(board).next("hello")["hello"]["boot_id"] > boot_id, "and it runs again"
 

@@ -9,7 +9,7 @@
  *   adc INPUT MILLIVOLT                       voltage on A0..A7
  *   sensors TAU_MS                            every pressure sensor follows its valve with a first-order lag, until `adc`
  *   reset | power-cycle                       reset pin; power off and on (RAM lost)
- *   hang                                      the main loop stops where it is, interrupts still run, until a reset
+ *   hang [cli]                                the main loop stops where it is until a reset; cli: interrupts are off too
  *   unplug | plug [PATH]                      pull the USB cable (the board keeps its power); back in, under a new name
  *   corrupt-rx|drop-rx|insert-rx P [SEED]     line noise towards the board, probability a byte
  *   corrupt-tx|drop-tx P [SEED]               line noise towards the host
@@ -117,7 +117,7 @@ void board_power_cycle(void)
     enter_reset("power-on");
 }
 
-bool board_hang(void)
+bool board_hang(bool deaf)
 {
     if (hang.on || held_until || (avr->reset_pc && avr->pc >= avr->reset_pc))
         return false; /* the bootloader has no watchdog */
@@ -126,7 +126,9 @@ bool board_hang(void)
     memcpy(hang.before, avr->flash + hang.at, 2);
     avr->flash[hang.at] = RJMP_SELF & 0xFF;
     avr->flash[hang.at + 1] = RJMP_SELF >> 8;
-    event("hang", "\"pc\":%u", (unsigned)avr->pc);
+    if (deaf)
+        avr->sreg[S_I] = 0;
+    event("hang", "\"pc\":%u,\"interrupts\":%s", (unsigned)avr->pc, deaf ? "false" : "true");
     return true;
 }
 

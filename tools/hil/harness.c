@@ -185,7 +185,7 @@ static bool run_command(char *line)
     } else if (!strcmp(verb, "power-cycle")) {
         board_power_cycle();
     } else if (!strcmp(verb, "hang")) {
-        known = board_hang();
+        known = board_hang(!strcmp(rest, "cli"));
     } else if (!strcmp(verb, "unplug")) {
         line_unplug();
     } else if (!strcmp(verb, "plug")) {

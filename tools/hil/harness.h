@@ -44,7 +44,7 @@ ticks_t board_now(void);
 void board_run(ticks_t until); /* may overshoot by one instruction */
 void board_reset_pin(void);    /* what DTR does when the port is opened */
 void board_power_cycle(void);  /* a reset that also loses the RAM */
-bool board_hang(void);         /* no progress in the main loop until the next reset; false: not possible now */
+bool board_hang(bool deaf);    /* no progress in the main loop until the next reset, interrupts off too if deaf; false: not now */
 void board_set_adc(unsigned input, unsigned millivolt);
 
 /* --- the serial line (line.c) ------------------------------------------------------------------------------------ */

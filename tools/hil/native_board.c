@@ -118,8 +118,9 @@ void board_power_on(const struct options *options)
     board_power_cycle();
 }
 
-bool board_hang(void)
+bool board_hang(bool deaf)
 {
+    (void)deaf; /* there are no interrupts here */
     hung = true;
     event("hang", "%s", "");
     return true;
