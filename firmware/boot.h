@@ -1,4 +1,4 @@
-/* What is known about the last reset. */
+/* The watchdog, and what is known about the last reset. */
 #ifndef BOOT_H
 #define BOOT_H
 
@@ -13,6 +13,9 @@ uint32_t boot_next_id(void);
 
 /* enum reset_cause; call after boot_next_id. */
 uint8_t boot_reset_cause(void);
+
+/* Feeds the hardware watchdog and remembers when. */
+void boot_feed_watchdog(uint32_t now_ms);
 
 #ifdef __cplusplus
 }

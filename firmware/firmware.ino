@@ -26,16 +26,23 @@ void setup() {
 }
 
 void loop() {
+  static uint32_t last_ms;
   const uint32_t now_ms = millis();
 
   // At most one receive buffer a pass, so that a flood cannot keep the checks from running.
   for (uint8_t i = 0; i < SERIAL_RX_BUFFER_SIZE && Serial.available() > 0; i++) {
     controller_receive(&board, (uint8_t)Serial.read(), now_ms);
   }
-  sensors_poll(&inputs);
-  const uint8_t checks = controller_update(&board, inputs.measured, inputs.supply_mv, now_ms);
-  for (uint8_t channel = 0; channel < CHANNELS_USED; channel++) {
-    pwm_write(channel, controller_counts(&board, channel));
+  if (now_ms != last_ms) {  // every byte wakes us; a millisecond is soon enough for all the rest
+    last_ms = now_ms;
+    sensors_poll(&inputs);
+    const uint8_t checks = controller_update(&board, inputs.measured, inputs.supply_mv, now_ms);
+    for (uint8_t channel = 0; channel < CHANNELS_USED; channel++) {
+      pwm_write(channel, controller_counts(&board, channel));
+    }
+    if (checks == CHECK_ALL) {
+      boot_feed_watchdog(now_ms);
+    }
   }
   // Never waits for the host to read.
   while (Serial.availableForWrite() > 0) {
@@ -44,9 +51,6 @@ void loop() {
       break;
     }
     Serial.write((uint8_t)next);
-  }
-  if (checks == CHECK_ALL) {
-    wdt_reset();
   }
   sleep_mode();  // until the next interrupt, a millisecond at most
 }
