@@ -15,9 +15,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, RobotFileError, Tripped
+from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, Tripped
+from modsoft.runtime.fit import check_board
 from modsoft.runtime.link import HELLO_WAIT_S, RESETS, Link, Phase, fault_names, refusal
-from modsoft.runtime.ports import PortInfo, list_ports, open_port
+from modsoft.runtime.ports import open_port
 from modsoft.runtime.protocol import (
     CHANNELS,
     PROTOCOL_HASH,
@@ -30,11 +31,8 @@ from modsoft.runtime.protocol import (
     Status,
     VentMode,
     to_bar,
-    to_units,
 )
 from modsoft.runtime.robot import Robot
-
-__all__ = ["Board", "Port", "PortInfo", "list_ports"]
 
 ARM_WAIT_S = 4.0  # a second of heartbeats, and the ramp of a vent before
 ARM_AGAIN_S = 0.1
@@ -163,7 +161,7 @@ class Board:
 
         Raises `ProtocolMismatch` when they differ, `Tripped` on a latched fault, `LostInRun`.
         """
-        channels = self._match(robot)
+        channels = check_board(self.hello, robot, self.name)
         deadline = self._clock() + ARM_WAIT_S
         while True:
             self._wait(lambda: self._link.can_arm, deadline)
@@ -183,36 +181,6 @@ class Board:
                 state = State(status.state).name if status is not None and status.state in set(State) else "unknown"
                 raise Tripped(f"board at {self.name} did not arm within {ARM_WAIT_S:.0f} s, its state is {state}")
             self._wait(lambda: False, self._clock() + ARM_AGAIN_S)
-
-    def _match(self, robot: Robot) -> int:
-        """The mask of the robot's channels, after every check that can be made before a valve moves (row by row)."""
-        hello, valve = self.hello, robot.valve
-        if valve is None:
-            raise RobotFileError(f"robot {robot.name} has no valves, so there is nothing to run on a board")
-        checks = (
-            ("valve full scale", hello.p_full, valve.full_scale_bar, "P_FULL", "full_scale_bar"),
-            ("smallest pressure", hello.p_min, valve.p_min_bar, "P_MIN", "p_min_bar"),
-            ("largest pressure", hello.p_max, valve.p_max_bar, "P_MAX", "p_max_bar"),
-        )
-        for what, board_units, robot_bar, constant, key in checks:
-            if board_units != to_units(robot_bar):
-                raise ProtocolMismatch(
-                    f"{what}: the board at {self.name} has {to_bar(board_units):g} bar, the robot file {robot_bar:g}; "
-                    f"correct {constant} in firmware/limits.h and flash it, or {key} in the robot file"
-                )
-        if to_bar(hello.slew) > robot.limits.slew_bar_per_s:
-            raise ProtocolMismatch(
-                f"the board at {self.name} moves pressures at {to_bar(hello.slew):g} bar/s, the robot file allows "
-                f"{robot.limits.slew_bar_per_s:g}; correct SLEW in firmware/limits.h and flash it"
-            )
-        for chamber in robot.chambers:
-            if chamber.channel >= hello.channels:
-                raise ProtocolMismatch(
-                    f"the robot file puts module {chamber.module} side {chamber.side} on channel {chamber.channel}, "
-                    f"the board at {self.name} has channels 0 to {hello.channels - 1}; correct [[chambers]] or "
-                    "CHANNELS_USED in firmware/pins.h"
-                )
-        return sum(1 << chamber.channel for chamber in robot.chambers)
 
     def set_pressures(self, tick: int, pressures_bar: ArrayLike) -> int:
         """Hand over the set-points (channels,), bar, of this tick and return at once with their sequence number.

@@ -16,6 +16,8 @@ import zlib
 from enum import IntEnum, IntFlag
 from typing import Annotated, NamedTuple, get_type_hints
 
+from modsoft.runtime.cobs import FrameError, cobs_decode, cobs_encode
+
 DELIMITER = 0x00
 MAX_DECODED = 96  # bytes, header and checksum included
 MAX_ENCODED = MAX_DECODED + 1  # one COBS code byte serves up to 254 bytes
@@ -86,7 +88,7 @@ class CType(NamedTuple):
 
     name: str
     code: str
-    count: int = 1
+    repeat: int = 1
 
 
 U8 = Annotated[int, CType("uint8_t", "B")]
@@ -226,10 +228,6 @@ class ForeignHello(NamedTuple):
     protocol_hash: int
 
 
-class FrameError(ValueError):
-    """These bytes are no frame of this protocol."""
-
-
 def fields(table: type) -> tuple[tuple[str, CType], ...]:
     """Return the (field, C type) rows of a message."""
     hints = get_type_hints(table, include_extras=True)
@@ -242,7 +240,7 @@ def definition() -> str:
     lines += [f"enum {enum.__name__} {member.name} {member.value}" for enum in ENUMS for member in enum]
     for name, identifier, table in MESSAGES:
         lines.append(f"message {name} {identifier}")
-        lines += [f"field {field} {ctype.name} {ctype.count}" for field, ctype in fields(table)]
+        lines += [f"field {field} {ctype.name} {ctype.repeat}" for field, ctype in fields(table)]
     return "\n".join(lines)
 
 
@@ -260,8 +258,8 @@ def _layouts() -> tuple[_Layout, ...]:
     result = []
     for _, identifier, table in MESSAGES:
         rows = [ctype for _, ctype in fields(table)]
-        packer = struct.Struct("<" + "".join(f"{row.count}{row.code}" for row in rows))
-        result.append(_Layout(identifier, table, packer, tuple(row.count for row in rows)))
+        packer = struct.Struct("<" + "".join(f"{row.repeat}{row.code}" for row in rows))
+        result.append(_Layout(identifier, table, packer, tuple(row.repeat for row in rows)))
     return tuple(result)
 
 
@@ -282,35 +280,6 @@ def to_units(pressure_bar: float) -> int:
 def to_bar(units: int) -> float:
     """Return a pressure in bar from the wire's unit of 10 Pa."""
     return units / UNITS_PER_BAR
-
-
-def cobs_encode(data: bytes) -> bytes:
-    """Return `data` without zero bytes (consistent overhead byte stuffing), delimiters not included."""
-    encoded = bytearray()
-    for run in data.split(b"\0"):
-        while len(run) >= 254:
-            encoded.append(255)
-            encoded += run[:254]
-            run = run[254:]
-        encoded.append(len(run) + 1)
-        encoded += run
-    return bytes(encoded)
-
-
-def cobs_decode(encoded: bytes) -> bytes:
-    """Return what `cobs_encode` was given; `FrameError` where that is impossible."""
-    decoded = bytearray()
-    position = 0
-    while position < len(encoded):
-        code = encoded[position]
-        run = encoded[position + 1 : position + code]
-        if code == 0 or len(run) != code - 1 or 0 in run:
-            raise FrameError(f"COBS run of {code - 1} bytes at {position} does not fit a frame of {len(encoded)} bytes")
-        decoded += run
-        position += code
-        if code < 255 and position < len(encoded):
-            decoded.append(0)
-    return bytes(decoded)
 
 
 def encode(message: Message, seq: int = 0, session: int = 0) -> bytes:

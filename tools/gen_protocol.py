@@ -44,7 +44,7 @@ def header() -> str:
     for name, _, table in protocol.MESSAGES:
         lines.append(f"struct __attribute__((packed)) {name.lower()} {{")
         for field, ctype in protocol.fields(table):
-            size = f"[{ctype.count}]" if ctype.count > 1 else ""
+            size = f"[{ctype.repeat}]" if ctype.repeat > 1 else ""
             lines.append(f"  {ctype.name} {field}{size};")
         lines += ["};", ""]
     lines += [

@@ -6,7 +6,7 @@ import zlib
 
 import pytest
 
-from modsoft.runtime import protocol
+from modsoft.runtime import cobs, protocol
 from modsoft.runtime.protocol import ClearFault, Fault, Hello, HelloReq, NackReason, State, Status, Vent, VentMode
 
 FULL = (3500,) * 6
@@ -247,7 +247,7 @@ def test_clock_and_tick_may_wrap(new_board, start_ms, ticks):
 @pytest.mark.parametrize("extra", [-1, 1])
 @pytest.mark.parametrize("message", [protocol.Vent(0), protocol.Heartbeat(1), protocol.Set(1, (0,) * 12)])
 def test_wrong_length_refused(running, message, extra):
-    whole = protocol.cobs_decode(protocol.encode(message, 1, running.session)[1:-1])[:-4]
+    whole = cobs.cobs_decode(protocol.encode(message, 1, running.session)[1:-1])[:-4]
     body = whole[:-1] if extra < 0 else whole + b"\0"
     running.messages()
     running.feed(b"\0" + with_crc(body) + b"\0")
@@ -264,7 +264,7 @@ def test_unknown_type_refused(running):
 
 
 def with_crc(body):
-    return protocol.cobs_encode(body + zlib.crc32(body).to_bytes(4, "little"))
+    return cobs.cobs_encode(body + zlib.crc32(body).to_bytes(4, "little"))
 
 
 # ---- timers and faults

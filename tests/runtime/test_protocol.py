@@ -5,13 +5,14 @@ from __future__ import annotations
 import random
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modsoft.runtime import protocol
+from modsoft.runtime import cobs, protocol
 
 ROOT = Path(__file__).resolve().parents[2]
 RANGES = {"uint8_t": (0, 0xFF), "uint16_t": (0, 0xFFFF), "uint32_t": (0, 0xFFFFFFFF), "int16_t": (-0x8000, 0x7FFF)}
@@ -19,7 +20,7 @@ RANGES = {"uint8_t": (0, 0xFF), "uint16_t": (0, 0xFFFF), "uint32_t": (0, 0xFFFFF
 
 def values(ctype):
     one = st.integers(*RANGES[ctype.name])
-    return one if ctype.count == 1 else st.tuples(*[one] * ctype.count)
+    return one if ctype.repeat == 1 else st.tuples(*[one] * ctype.repeat)
 
 
 def messages():
@@ -45,9 +46,9 @@ def test_round_trip(message, seq, session):
 
 @given(st.binary(max_size=1000))
 def test_cobs_round_trip(data):
-    encoded = protocol.cobs_encode(data)
+    encoded = cobs.cobs_encode(data)
     assert 0 not in encoded
-    assert protocol.cobs_decode(encoded) == data
+    assert cobs.cobs_decode(encoded) == data
 
 
 @given(st.lists(st.one_of(messages(), st.binary(min_size=1, max_size=20)), max_size=8), st.integers(1, 40))
@@ -97,17 +98,17 @@ def test_endless_frame_takes_no_memory_and_is_counted_once():
 
 
 def test_wrong_lengths_and_types_are_no_messages():
-    with pytest.raises(protocol.FrameError, match="shorter"):
-        protocol.decode(protocol.cobs_encode(b"abc"))
-    with pytest.raises(protocol.FrameError, match="longer"):
+    with pytest.raises(cobs.FrameError, match="shorter"):
+        protocol.decode(cobs.cobs_encode(b"abc"))
+    with pytest.raises(cobs.FrameError, match="longer"):
         protocol.decode(b"\x01" * 98)
     for body, complaint in ((b"\x77\0\0", "unknown message 0x77"), (b"\x12\0\0\0\0", "Vent of 2 bytes, not 1")):
-        with pytest.raises(protocol.FrameError, match=complaint):
+        with pytest.raises(cobs.FrameError, match=complaint):
             protocol.decode(sealed(body))
 
 
 def sealed(body):
-    return protocol.cobs_encode(body + protocol.zlib.crc32(body).to_bytes(4, "little"))
+    return cobs.cobs_encode(body + zlib.crc32(body).to_bytes(4, "little"))
 
 
 def test_hello_of_another_protocol_still_tells_its_hash():
@@ -128,7 +129,7 @@ def test_units(units):
 
 def test_every_frame_fits():
     for _, _, table in protocol.MESSAGES:
-        size = sum(ctype.count * {"B": 1, "H": 2, "h": 2, "I": 4}[ctype.code] for _, ctype in protocol.fields(table))
+        size = sum(ctype.repeat * {"B": 1, "H": 2, "h": 2, "I": 4}[ctype.code] for _, ctype in protocol.fields(table))
         assert protocol.HEADER_LENGTH + size + protocol.CRC_LENGTH <= protocol.MAX_DECODED
 
 
@@ -136,7 +137,7 @@ def test_hash_follows_the_definition(monkeypatch):
     before = protocol.definition()
     monkeypatch.setattr(protocol, "SEQUENCE_WINDOW", 9)
     assert protocol.definition() != before
-    assert protocol.PROTOCOL_HASH == protocol.zlib.crc32(before.encode())
+    assert protocol.PROTOCOL_HASH == zlib.crc32(before.encode())
 
 
 def generate(*options, cwd=ROOT):
