@@ -24,7 +24,9 @@ def from_directors(directors: Array, base: Array | None = None) -> Array:
     directors = np.asarray(directors, dtype=np.float64)
     first = np.broadcast_to(np.eye(3) if base is None else base, directors[..., :1, :, :].shape)
     before = np.concatenate([first, directors[..., :-1, :, :]], axis=-3)
-    return np.einsum("...ij,...j->...i", before, directors[..., 2, :])
+    tangent = directors[..., 2, None, :]
+    # Term by term: a dot product of numpy's may round differently for another number of robots.
+    return before[..., 0] * tangent[..., 0] + before[..., 1] * tangent[..., 1] + before[..., 2] * tangent[..., 2]
 
 
 def from_poses(poses: Array) -> Array:

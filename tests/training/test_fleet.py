@@ -1,0 +1,186 @@
+"""The fast plant against PyElastica, against the recorded runs, and against itself in other places of a batch."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from modsoft.runtime.errors import ModsoftError
+from modsoft.training import fleet, kernel
+from modsoft.training.arm import Arm
+from modsoft.training.fleet import Arms, Fleet
+from modsoft.training.robots import PLANTS
+
+REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
+ACTIONS = {"cable": 2, "pneumatic": 1}
+
+needs_kernel = pytest.mark.skipif(kernel.library() is None, reason="the kernel is not built here (no C compiler)")
+
+
+def actions(kind, periods, count, modules, seed=0, largest=1.0):
+    shape = (periods, count, modules, ACTIONS[kind])
+    return largest * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
+
+
+def arm_run(kind, modules, drawn):
+    arm = Arm(kind, modules)
+    configuration = [arm.configuration]
+    for action in drawn:
+        arm.step(action)
+        configuration.append(arm.configuration)
+    return np.stack(configuration)
+
+
+def largest_difference(kind, modules, periods, seed):
+    """Between the fleet and PyElastica, both with explicit damping, after every period of full-range random actions."""
+    drawn = actions(kind, periods, 1, modules, seed)
+    configuration = Fleet(kind, modules, 1, damping="explicit").run(drawn)
+    return np.abs(configuration[:, 0] - arm_run(kind, modules, drawn[:, 0])).max()
+
+
+@needs_kernel
+@pytest.mark.parametrize(("kind", "modules"), [("cable", 2), ("cable", 4), ("pneumatic", 2), ("pneumatic", 3)])
+def test_equals_pyelastica_after_50_periods(kind, modules):
+    assert largest_difference(kind, modules, 50, seed=modules) < 1e-9
+
+
+# tools/bench/simulation.py --compare does all of them over 50 periods
+@needs_kernel
+@pytest.mark.parametrize(("kind", "modules"), [("cable", 3), ("cable", 6), ("cable", 12), ("pneumatic", 4)])
+def test_equals_pyelastica_for_other_module_numbers(kind, modules):
+    assert largest_difference(kind, modules, 5, seed=2) < 1e-9
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Actions (250, 3, 4, 2) and configurations (250, 3, 4, 3) of the three recorded runs, side by side."""
+    if not REFERENCE.is_dir():
+        pytest.skip("the recorded runs are not here (../shared/reference)")
+    runs = [np.load(REFERENCE / f"four_module_bilstm_task_{task}.npz") for task in "abc"]
+    configuration = np.stack([run["real_list"].transpose(2, 0, 1)[..., [1, 2, 0]] for run in runs], axis=1)
+    return np.stack([run["act_list"] for run in runs], axis=1), configuration
+
+
+@needs_kernel
+def test_replays_the_recorded_runs(recorded):
+    drawn, configuration = recorded
+    replayed = Fleet("cable", 4, 3, damping="explicit").run(drawn)
+    assert np.abs(replayed[:-1] - configuration).max() < 5e-6
+
+
+@needs_kernel
+def test_exponential_damping_stays_close_to_the_recorded_runs(recorded):
+    drawn, configuration = recorded
+    replayed = Fleet("cable", 4, 3).run(drawn)
+    assert np.abs(replayed[:-1] - configuration).mean() < 2e-6
+
+
+@needs_kernel
+@pytest.mark.parametrize("kind", ["cable", "pneumatic"])
+def test_numbers_do_not_depend_on_place_or_company(kind):
+    drawn = actions(kind, 2, 19, 3, seed=1)
+    together = Fleet(kind, 3, 19).run(drawn)
+    assert np.array_equal(together[:, 5:6], Fleet(kind, 3, 1).run(drawn[:, 5:6]))
+    order = np.random.default_rng(2).permutation(19)
+    assert np.array_equal(together[:, order], Fleet(kind, 3, 19, threads=2).run(drawn[:, order]))
+
+
+@needs_kernel
+@pytest.mark.parametrize("kind", ["cable", "pneumatic"])
+def test_variants_agree(kind):
+    drawn = actions(kind, 3, 3, 2, seed=3)
+    runs = [Fleet(kind, 2, 3, variant=name).run(drawn) for name in kernel.variants()]
+    for run in runs[1:]:
+        assert np.abs(run - runs[0]).max() < 1e-11
+
+
+@needs_kernel
+@pytest.mark.parametrize("kind", ["cable", "pneumatic"])
+def test_a_lost_robot_is_reported_and_the_others_are_untouched(kind):
+    drawn = actions(kind, 3, 10, 2, seed=4)
+    whole = Fleet(kind, 2, 10).run(drawn)
+    robots = Fleet(kind, 2, 10)
+    before = robots.run(drawn[:1])
+    robots._state[:, 5, 3, 3] = np.inf  # the velocity of one node of robot 3 and of those in its lane in other blocks
+    lost = np.arange(10) % robots.lanes == 3
+    run = np.concatenate([before, robots.run(drawn[1:])[1:]])
+    assert np.array_equal(robots.alive, ~lost)
+    assert np.array_equal(run[:, ~lost], whole[:, ~lost])
+    assert np.isnan(run[2:, lost]).any(axis=(2, 3)).all()
+    robots.reset(np.flatnonzero(lost))
+    assert robots.alive.all()
+    assert np.array_equal(robots.configuration[lost], run[0, lost])
+    assert np.array_equal(robots.configuration[~lost], whole[-1, ~lost])
+
+
+@needs_kernel
+def test_reset_begins_the_same_run_again():
+    drawn = actions("pneumatic", 3, 4, 2, seed=5)
+    robots = Fleet("pneumatic", 2, 4)
+    first = robots.run(drawn)
+    robots.reset()
+    assert np.array_equal(robots.run(drawn), first)
+
+
+@needs_kernel
+def test_exponential_damping_keeps_what_explicit_damping_loses():
+    """Full-range first actions on twelve modules: PyElastica's explicit damping loses some of them too."""
+    drawn = actions("cable", 1, 16, 12, seed=6)
+    explicit, exponential = Fleet("cable", 12, 16, damping="explicit"), Fleet("cable", 12, 16)
+    explicit.run(drawn)
+    exponential.run(drawn)
+    assert not explicit.alive.all()
+    assert exponential.alive.all()
+
+
+@needs_kernel
+def test_a_bend_sharper_than_the_series_hold_for_is_a_loss():
+    robots = Fleet("cable", 2, 2)
+    angle = 0.6
+    turned = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+    robots._state[0, 20, 6:15, 1] = np.ravel(turned)
+    robots.step(np.zeros((2, 2, 2)), period_s=0.05)
+    assert robots.alive.tolist() == [True, False]
+
+
+@needs_kernel
+def test_wrong_shapes_and_periods_are_refused():
+    robots = Fleet("cable", 2, 3)
+    with pytest.raises(ValueError, match=r"expected \(3, 2, 2\)"):
+        robots.step(np.zeros((3, 4, 2)))
+    with pytest.raises(ValueError, match="found an actuation of 1.5"):
+        robots.step(np.full((3, 2, 2), 1.5))
+    with pytest.raises(ValueError, match="found an actuation of nan"):
+        robots.step(np.full((3, 2, 2), np.nan))
+    with pytest.raises(ValueError, match="whole number"):
+        robots.step(np.zeros((3, 2, 2)), period_s=1.1e-4)
+    with pytest.raises(ModsoftError, match="expected one of"):
+        Fleet("cable", 2, 3, variant="mmx")
+
+
+def test_pyelastica_serves_where_the_kernel_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr(kernel, "library", lambda: None)
+    robots = fleet.simulated("pneumatic", 2, 3)
+    assert isinstance(robots, Arms)
+    assert capsys.readouterr().err.count("\n") == 1
+    with pytest.raises(ModsoftError, match="make install"):
+        Fleet("pneumatic", 2, 3)
+    drawn = actions("pneumatic", 2, 3, 2, seed=7)
+    before = robots.run(drawn[:1])
+    robots._arms[1]._rod.velocity_collection[0, 5] = np.inf
+    run = np.concatenate([before, robots.run(drawn[1:])[1:]])
+    assert run.shape == (3, 3, 2, 3)
+    assert robots.alive.tolist() == [True, False, True]
+    assert np.isnan(run[2, 1]).all()
+    assert np.isfinite(run[:, [0, 2]]).all()
+    robots.reset()
+    assert np.array_equal(robots.configuration, run[0])
+    assert robots.alive.all()
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+def test_opposite_cables_share_an_actuator_and_chambers_do_not(kind):
+    axes, places = kernel.places(PLANTS[kind])
+    assert len(axes) == 2
+    assert axes == ([0, 1] if kind == "cable" else [0, 0])
+    assert sorted(np.sign(places)) == ([1, 1] if kind == "cable" else [-1, 1])

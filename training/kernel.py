@@ -1,0 +1,152 @@
+"""The compiled kernel of `fleet.py`: where it is, which variants run here, and the plant in the form that it takes."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.util
+import math
+from typing import Literal
+
+import numpy as np
+
+from modsoft.runtime.errors import ModsoftError
+from modsoft.training.robots import Plant
+
+Damping = Literal["exponential", "explicit"]
+
+VARIANTS = ("plain", "avx2", "avx512")  # by the instructions they need
+MOST_ACTUATORS = 4
+
+
+class PlantStruct(ctypes.Structure):
+    """`struct plant` of fleet.c, field by field."""
+
+    _fields_ = (
+        ("actuators", ctypes.c_int64),
+        ("axis", ctypes.c_int64 * MOST_ACTUATORS),
+        ("lags", ctypes.c_int64),
+        ("wall", ctypes.c_int64),
+        ("stiffening_half_powers", ctypes.c_int64),
+        ("time_step", ctypes.c_double),
+        ("rest_length", ctypes.c_double),
+        ("inverse_rest_length", ctypes.c_double),
+        ("volume_over_pi", ctypes.c_double),
+        ("shear", ctypes.c_double),
+        ("stretch", ctypes.c_double),
+        ("bend", ctypes.c_double * 3),
+        ("half_damping", ctypes.c_double),
+        ("drag", ctypes.c_double * 3),
+        ("weight", ctypes.c_double * 4),
+        ("longest", ctypes.c_double),
+        ("valve_share", ctypes.c_double),
+        ("chamber_share", ctypes.c_double),
+        ("inverse_stiffening_tension", ctypes.c_double),
+        ("friction", ctypes.c_double),
+        ("friction_curvature", ctypes.c_double),
+        ("gravity_kick", ctypes.c_double),
+        ("gyration", ctypes.c_double * 3),
+        ("turn_kick", ctypes.c_double * 3),
+        ("fade_kick", ctypes.c_double * 3),
+    )
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The compiled kernel, or None where this installation has none (no C compiler when it was made)."""
+    spec = importlib.util.find_spec("modsoft.training._fleet")
+    if spec is None or spec.origin is None:
+        return None
+    found = ctypes.CDLL(spec.origin)
+    if found.fleet_plant_bytes() != ctypes.sizeof(PlantStruct):
+        raise ModsoftError(f"{spec.origin} is not of this version of modsoft; install it again (make install)")
+    pointer = ctypes.c_void_p
+    found.fleet_advance.argtypes = (
+        [ctypes.c_int, pointer, ctypes.c_int, ctypes.c_int, ctypes.c_int, pointer, pointer, pointer, ctypes.c_long]
+    )  # fmt: skip
+    found.fleet_advance.restype = None
+    return found
+
+
+def variants() -> list[str]:
+    """The variants of the kernel that this processor can run, the fastest last; empty without a kernel."""
+    found = library()
+    return [] if found is None else [name for i, name in enumerate(VARIANTS) if found.fleet_lanes(i)]
+
+
+def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct:
+    """The plant as the kernel wants it. The rod's own numbers are PyElastica's: a disk's second moments, 27/28 for the
+    shear of a section, a third of Young's modulus for shear."""
+    length = plant.module_length_m / plant.elements
+    area = math.pi * plant.radius_m**2
+    moment = area**2 / (4 * math.pi)
+    young, shear = plant.youngs_modulus_pa, plant.youngs_modulus_pa / 3
+    inertia = plant.rotary_inertia_ratio * plant.density_kg_m3 * length * moment
+    inertias = (inertia, inertia, 2 * inertia)
+    # Explicit: the damping torque is kicked like any other. Exponential: each kick is weighted as the exact solution of
+    # dw/dt = a - c w weights a, which is stable at any c; c at rest length.
+    kick = [time_step_s] * 3
+    if damping == "exponential":
+        rates = [plant.torque_damping_n_s * length / each for each in inertias]
+        kick = [-math.expm1(-rate * time_step_s) / rate if rate else time_step_s for rate in rates]
+    drag = np.array([plant.drag_transverse, plant.drag_transverse, plant.drag_axial])
+    actuators = plant.actuators
+    axes, _ = places(plant)
+    lags = (actuators.valve_lag_s, actuators.chamber_lag_s)
+    shares = [1.0 - math.exp(-time_step_s / lag) if lag else 1.0 for lag in lags]
+    half_powers = 2 * plant.stiffening_power
+    if half_powers not in range(1, 17):
+        raise ModsoftError(f"stiffening_power is {plant.stiffening_power}, expected 0.5, 1, 1.5 ... 8")
+    if len(actuators.weight) > 4:
+        raise ModsoftError(f"an actuator's weight has {len(actuators.weight)} coefficients, expected at most 4")
+    return PlantStruct(
+        actuators=len(axes),
+        axis=tuple(axes),
+        lags=any(lags),
+        wall=plant.friction_n_m2 > 0 or math.isfinite(plant.stiffening_tension_n),
+        stiffening_half_powers=int(half_powers),
+        time_step=time_step_s,
+        rest_length=length,
+        inverse_rest_length=1 / length,
+        volume_over_pi=area * length / math.pi,
+        shear=27 / 28 * shear * area,
+        stretch=plant.axial_ratio * young * area,
+        bend=(young * moment, young * moment, 2 * shear * moment),
+        half_damping=0.5 * plant.damping_n_s_m2,
+        drag=tuple(0.5 * drag / (plant.radius_m * length)),
+        weight=(*actuators.weight, 0.0, 0.0, 0.0)[:4],
+        longest=actuators.longest,
+        valve_share=shares[0],
+        chamber_share=shares[1],
+        inverse_stiffening_tension=1 / plant.stiffening_tension_n,
+        friction=plant.friction_n_m2,
+        friction_curvature=plant.friction_curvature_per_m,
+        gravity_kick=time_step_s * plant.gravity_m_s2,
+        gyration=tuple(kick),
+        turn_kick=tuple(each / j for each, j in zip(kick, inertias, strict=True)),
+        fade_kick=tuple(each * plant.torque_damping_n_s / j for each, j in zip(kick, inertias, strict=True)),
+    )
+
+
+def places(plant: Plant) -> tuple[list[int], list[float]]:
+    """Axis (0 or 1) and place (radii along it) of the actuators that act at a time.
+
+    Of two opposite cables only one pulls, so that the pair is one actuator that changes sides: place of the first.
+    """
+    actuators = plant.actuators
+    degrees = np.array(actuators.angles_deg) % 360.0
+    if not np.isin(degrees, (0.0, 90.0, 180.0, 270.0)).all():
+        raise ModsoftError(f"actuators at {actuators.angles_deg} degrees; expected 0, 90, 180 or 270")
+    if alternate(plant):
+        degrees = degrees[::2]
+    if len(degrees) > MOST_ACTUATORS:
+        raise ModsoftError(f"{len(degrees)} actuators act at a time, expected at most {MOST_ACTUATORS}")
+    signs = np.where(degrees < 180.0, 1.0, -1.0)
+    return [int(each) for each in degrees // 90.0 % 2], [float(each) for each in actuators.offset_ratio * signs]
+
+
+def alternate(plant: Plant) -> bool:
+    """Whether of two channels in a row never both are under stress, and they stand on opposite sides."""
+    actuators = plant.actuators
+    apart = np.diff(np.array(actuators.angles_deg).reshape(-1, 2), axis=-1) % 360.0
+    return actuators.rest_stress_pa == 0 and actuators.valve_lag_s == 0 and bool((apart == 180.0).all())
