@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import shutil
 import signal
 import sys
 from collections.abc import Iterator
@@ -14,13 +15,15 @@ from types import FrameType
 import click
 from tqdm import tqdm
 
-from modsoft.runtime import robot as robots
 from modsoft.runtime.command import entry
 from modsoft.runtime.controller import Controller
 from modsoft.runtime.trajectory import load_task
 
 RUN_SLACK_S = 60.0  # start, arming, venting and closing of the runtime, beyond its ticks
 AFTER_S = 1.5  # the trace goes on for so long, until the chambers are empty
+RUN_FILES = ("run.jsonl", "meta.json")  # of the runtime's log
+WRITTEN = (*RUN_FILES, "board.jsonl", "plant.jsonl", "runtime.out", "runtime.err", "report.md", "report.json",
+           "angles.png")  # fmt: skip
 
 
 @click.command("modsoft-hil", context_settings={"show_default": True})
@@ -52,22 +55,29 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     from modsoft.hil import judge, record  # after --help: matplotlib takes a second to import
     from modsoft.hil import report as reports
     from modsoft.hil.emulator import build, choose
+    from modsoft.hil.plant import load_robot
     from modsoft.hil.rig import Rig
 
-    robot = robots.load(robot_file)
+    robot = load_robot(robot_file)
     desired = load_task(task, robot)
     Controller.load(model).check(robot)  # the runtime does it too; here it saves the start of the rig
     count = min(steps or len(desired), len(desired))
     build(choose(board))
 
     report.mkdir(parents=True, exist_ok=True)
+    for name in WRITTEN:  # whatever is found there afterwards is of this run
+        (report / name).unlink(missing_ok=True)
     options = [] if steps is None else ["--steps", str(steps)]
     with _ended_in_order(), Rig(robot_file, report, board) as rig:
         rig.run(model, task, *options)
         with tqdm(total=count, unit=" ticks", desc="run", disable=not sys.stderr.isatty()) as bar:
             rig.wait(count * robot.loop.period_s + RUN_SLACK_S, lambda ticks: bar.update(ticks - bar.n))
         rig.settle(AFTER_S)
-    found = record.read(report, rig.run_folder(), rig.robot, task, count, rig.runtime.returncode)
+    if run := rig.run_folder():
+        for name in RUN_FILES:
+            shutil.move(run / name, report / name)
+        shutil.rmtree(rig.runs)
+    found = record.read(report, report if run else None, robot, task, count, rig.runtime.returncode)
     verdict = judge.judge(found)
     about = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -83,6 +93,8 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     reports.write(found, verdict, about, report)
     for line in [*verdict.acceptances, *verdict.witnesses]:
         click.echo(f"{'ok' if line.ok else 'NO':>4}  {line.name}: {line.found} ({line.limit})")
+    if found.runtime_exit:
+        click.echo(f"modsoft-runtime said: {found.runtime_said or 'nothing'}")
     click.echo(f"{verdict}\n{report / 'report.md'}")
     return verdict.exit_code
 

@@ -75,6 +75,14 @@ def tool_poses(positions: Array, directors: Array) -> Array:
     return BASE_IN_TRACKER @ in_base
 
 
+def load_robot(robot_file: str | Path) -> Robot:
+    """The robot file of a robot that the rig can run; `RobotFileError` for one without valves."""
+    robot = robots.load(robot_file)
+    if robot.robot.kind != "pneumatic":
+        raise RobotFileError(f"{robot_file}: a {robot.robot.kind} robot has no valves; the rig runs pneumatic robots")
+    return robot
+
+
 class Plant:
     """The arm behind its valves: duties in, poses and chamber pressures out."""
 
@@ -161,9 +169,7 @@ def cli(robot_file: Path) -> None:
     """The simulated pneumatic robot in real time (started by modsoft-hil)."""
     from modsoft.training.arm import Arm  # the simulator takes a second to import
 
-    robot = robots.load(robot_file)
-    if robot.robot.kind != "pneumatic":
-        raise RobotFileError(f"{robot_file}: a {robot.robot.kind} robot has no valves; the rig runs pneumatic robots")
+    robot = load_robot(robot_file)
 
     def write(line: dict[str, Any]) -> None:
         sys.stdout.write(json.dumps(line) + "\n")

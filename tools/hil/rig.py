@@ -25,10 +25,9 @@ from types import TracebackType
 from typing import IO, Any
 
 from modsoft.hil.emulator import EmulatedBoard
+from modsoft.hil.plant import load_robot
 from modsoft.hil.polaris import write_tool_files
-from modsoft.runtime import robot as robots
-from modsoft.runtime.errors import DeviceAbsent, LostInRun, RobotFileError, UsageError
-from modsoft.runtime.robot import Robot
+from modsoft.runtime.errors import DeviceAbsent, LostInRun, UsageError
 
 Line = dict[str, Any]
 
@@ -114,11 +113,10 @@ class Rig:
 
     def __init__(self, robot_file: str | Path, folder: Path, board: str = "auto"):
         """`robot_file`: file or shipped name; `folder`: where the traces and the runtime's words go."""
-        self.robot: Robot = robots.load(robot_file)
-        if self.robot.robot.kind != "pneumatic":
-            raise RobotFileError(f"{robot_file}: a {self.robot.robot.kind} robot has no valves to emulate")
+        self.robot = load_robot(robot_file)
         self._robot_file = str(Path(robot_file).resolve() if Path(robot_file).is_file() else robot_file)
         self.folder = folder
+        self.runs = folder / "runs"
         self.board = EmulatedBoard(board, on_event=self._board_event)
         self.plant: Child | None = None
         self.tracker: Child | None = None
@@ -165,17 +163,17 @@ class Rig:
     def run(self, model: str | Path, task: str, *options: str) -> subprocess.Popen[bytes]:
         """Starts modsoft-runtime, unmodified, as anybody would: its console script, beside this interpreter.
 
-        Its log goes to `folder`/runs, what it says to runtime.out and runtime.err. Further options are passed on.
+        Its log goes to a folder in `runs`, what it says to runtime.out and runtime.err. Further options are passed on.
         """
         script = Path(sys.executable).parent / "modsoft-runtime"
         if not script.is_file():
             raise UsageError(f"no {script.name} beside {Path(sys.executable).name}: pip install modsoft there first")
-        shutil.rmtree(self.folder / "runs", ignore_errors=True)
+        shutil.rmtree(self.runs, ignore_errors=True)
         tools = [option for path in self.tool_files for option in ("--tool", str(path))]
         command = [
             str(script), "--yes", "--robot", self._robot_file, "--model", str(model), "--task", task,
             "--port", self.board.port, "--tracker", "ndi", "--tracker-port", self.tracker_port, *tools,
-            "--runs-dir", str(self.folder / "runs"), *options,
+            "--runs-dir", str(self.runs), *options,
         ]  # fmt: skip
         with (self.folder / "runtime.out").open("wb") as out, (self.folder / "runtime.err").open("wb") as errors:
             self.runtime = subprocess.Popen(
@@ -207,7 +205,7 @@ class Rig:
 
     def run_folder(self) -> Path | None:
         """Where the runtime logs, as soon as it does."""
-        found = sorted((self.folder / "runs").glob("*/run.jsonl"))
+        found = sorted(self.runs.glob("*/run.jsonl"))
         return found[-1].parent if found else None
 
     def ticks(self) -> int:

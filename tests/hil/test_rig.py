@@ -1,0 +1,230 @@
+"""The whole chain in real time: the unmodified modsoft-runtime on the emulated board, the fake tracker and the
+simulated robot; what happens to the valves when it is killed; and that nothing is left behind."""
+
+import contextlib
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from modsoft.hil import judge, record
+from modsoft.hil.polaris import write_tool_files
+from modsoft.hil.rig import Child, Rig
+from modsoft.runtime import robot as robots
+
+SCRIPTS = Path(sys.executable).parent
+
+
+def script(name, *arguments, **options):
+    """A console script, run to its end: (exit code, last line of standard error)."""
+    done = subprocess.run(
+        [SCRIPTS / name, *map(str, arguments)], capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=60,
+        **options,
+    )  # fmt: skip
+    return done.returncode, done.stderr.strip()
+
+
+def descendants(pid):
+    """Process ids below `pid`."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in map(int, task.read_text().split()):
+            found += [child, *descendants(child)]
+    return found
+
+
+def alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def wait_until(true, timeout_s):
+    deadline = time.monotonic() + timeout_s
+    while not true():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.05)
+
+
+def run(folder, robot, model, steps):
+    """A short run; every acceptance apart from its length."""
+    with Rig(robot, folder) as rig:
+        rig.run(model, "down", "--steps", str(steps))
+        rig.wait(60)
+        rig.settle(1.5)
+    return judge.judge(record.read(folder, rig.run_folder(), rig.robot, "down", steps, rig.runtime.returncode))
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("robot", ["pneumatic-3", "pneumatic-2"])
+def test_a_model_of_three_modules_runs_robots_of_three_and_two(robot, model_file, tmp_path):
+    verdict = run(tmp_path, robot, model_file, steps=20)
+    table = "\n".join(f"{line.ok}  {line.name}: {line.found} ({line.limit})" for line in verdict.acceptances)
+    print(table)
+    assert verdict.word == "not judged", table
+    if "too slow" not in verdict.reason:
+        assert all(line.ok for line in verdict.acceptances), table
+
+
+@pytest.mark.realtime
+def test_a_killed_runtime_leaves_every_valve_at_0_within_700_ms(model_file, tmp_path):
+    """The board does it alone. Random phases of the control period, from the pressures of a running task."""
+    worst_ms = 0.0
+    phases = random.Random(0)
+    with Rig("pneumatic-3", tmp_path) as rig:
+        for _ in range(3):
+            process = rig.run(model_file, "down")
+            wait_until(lambda: rig.ticks() >= 5 or rig.runtime.poll() is not None, 20)
+            assert process.poll() is None, rig.said()
+            time.sleep(phases.uniform(0.0, 0.4))
+            assert max(rig.board.duties()) > 0, "nothing would have to be vented"
+            process.kill()
+            killed_ns = time.monotonic_ns()
+            process.wait()
+            time.sleep(1.2)
+            took_ms = record.vented_after_ms(list(rig.board.trace), killed_ns)
+            print(f"killed: all valves at 0 after {took_ms:.0f} ms of emulated time")
+            assert not math.isnan(took_ms)
+            worst_ms = max(worst_ms, took_ms)
+    print(f"{{fault: runtime SIGKILLed, tries: 3, limit: 700 ms, worst: {worst_ms:.0f} ms}}")
+    assert worst_ms <= 700
+
+
+def ticked(folder):
+    """Whether a run that logs below `folder` has begun."""
+    return any(b'\n{"tick"' in log.read_bytes() for log in folder.glob("runs/*/run.jsonl"))
+
+
+def rig_command(folder, model):
+    return [
+        SCRIPTS / "modsoft-hil", "--robot", "pneumatic-3", "--model", model, "--task", "down", "--report", folder,
+    ]  # fmt: skip
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_nothing_outlives_the_rig(number, code, model_file, tmp_path):
+    with subprocess.Popen(
+        rig_command(tmp_path, model_file), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    ) as process:
+        try:
+            wait_until(lambda: ticked(tmp_path) or process.poll() is not None, 30)
+            assert process.poll() is None
+            below = descendants(process.pid)
+            assert len(below) >= 4, "board, tracker, robot, runtime"
+            process.send_signal(number)
+            assert process.wait(20) == code
+            wait_until(lambda: not any(map(alive, below)), 15)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+    if number != signal.SIGKILL:  # a killed rig has not written all that it knew
+        duties = record.valves(record.lines(tmp_path / "board.jsonl")).duty
+        assert duties.any()
+        assert not duties[-1].any(), "the runtime is given the time to vent"
+
+
+@pytest.mark.realtime
+def test_an_exception_inside_ends_everything(model_file, tmp_path):
+    below = []
+
+    def break_off():
+        with Rig("pneumatic-3", tmp_path, board="native") as rig:
+            rig.run(model_file, "down")
+            below.extend(descendants(os.getpid()))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        break_off()
+    assert len(below) >= 4
+    assert not [pid for pid in below if alive(pid)]
+
+
+# ---- What is wrong is said in one line, before anything moves
+
+
+@pytest.fixture(scope="module")
+def tracker(tmp_path_factory):
+    """A fake tracker that works: (port, options that name its tools)."""
+    folder = tmp_path_factory.mktemp("tracker")
+    child = Child("modsoft.hil.polaris", ["--link", str(folder / "ttyPolaris")], lambda line: None)
+    try:
+        child.wait_ready()
+        yield folder / "ttyPolaris", [part for path in write_tool_files(folder, 4) for part in ("--tool", path)]
+    finally:
+        child.stop()
+
+
+def broken_robot(folder):
+    path = folder / "robot.toml"
+    path.write_text(robots.text_of("pneumatic-3").replace("modules = 3", "moduls = 3"))
+    return path
+
+
+def damaged(model, folder):
+    data = bytearray(model.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path = folder / "damaged.onnx"
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("wrong", "code", "says"),
+    [
+        ("robot", 64, "moduls"),
+        ("no robot", 64, "pneumatic-9"),
+        ("cable robot", 64, "cable"),
+        ("model", 65, "damaged.onnx"),
+        ("no model", 65, "none.onnx"),
+        ("port", 69, "ttyNone"),
+        ("port not told", 2, "--port"),
+        ("tracker", 69, "ttyNoTracker"),
+        ("tracker not told", 2, "--tracker-port"),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_its_own_exit_code(wrong, code, says, model_file, tracker, tmp_path):
+    port, tools = tracker
+    options = {"--robot": "pneumatic-3", "--model": model_file, "--task": "down"}
+    options |= {"--port": port, "--tracker-port": port}  # any port that exists: the board's is opened last
+    options |= {"--runs-dir": tmp_path / "runs"}
+    match wrong:
+        case "robot":
+            options["--robot"] = broken_robot(tmp_path)
+        case "no robot":
+            options["--robot"] = "pneumatic-9"
+        case "cable robot":
+            options["--robot"] = "cable-4"
+        case "model":
+            options["--model"] = damaged(model_file, tmp_path)
+        case "no model":
+            options["--model"] = tmp_path / "none.onnx"
+        case "port":
+            options["--port"] = tmp_path / "ttyNone"
+        case "port not told":
+            del options["--port"]
+        case "tracker not told":
+            del options["--tracker-port"]
+        case "tracker":
+            options["--tracker-port"] = tmp_path / "ttyNoTracker"
+    found, said = script("modsoft-runtime", "--yes", *tools, *(part for pair in options.items() for part in pair))
+    assert (found, len(said.splitlines())) == (code, 1), said
+    assert says in said
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "code"), [("--robot", "cable-4", 64), ("--model", "none.onnx", 65), ("--task", "jump", 2)]
+)
+def test_the_rig_starts_nothing_for_a_wrong_order(option, value, code, model_file, tmp_path):
+    options = {"--robot": "pneumatic-3", "--model": model_file, "--task": "down", "--report": tmp_path / "out"}
+    options[option] = value
+    found, said = script("modsoft-hil", *(part for pair in options.items() for part in pair), cwd=tmp_path)
+    assert (found, len(said.splitlines())) == (code, 1), said
+    assert not (tmp_path / "out").exists()
