@@ -99,12 +99,12 @@ def train(
         torch.set_rng_state(state["random_state"])
 
     per_epoch = -(-len(training) // settings.batch)
-    check_every = max(1, settings.iterations // CHECKS)
     iteration = first = state["iteration"]
     began_s = clock() - state["elapsed_s"]
-    checked_s, loss_sum = clock(), 0.0
+    checked, checked_s, loss_sum = iteration, clock(), 0.0
     order = np.zeros(0)
     share = _share(iteration, clock() - began_s, settings)
+    next_check = _checks_due(share) + 1
     while share < 1.0 and state["worse"] < PATIENCE:
         epoch, step = divmod(iteration, per_epoch)
         if step == 0 or iteration == first:
@@ -123,7 +123,8 @@ def train(
         loss_sum += loss.item()
         share = _share(iteration, clock() - began_s, settings)
 
-        if iteration % check_every == 0 or share >= 1.0:
+        if _checks_due(share) >= next_check:
+            next_check = _checks_due(share) + 1
             percent = float(estimation_errors(network, validation).mean())
             if percent < state["best_percent"]:
                 weights = {name: value.clone() for name, value in network.state_dict().items()}
@@ -131,10 +132,10 @@ def train(
             else:
                 state["worse"] += 1
             now_s = clock()
-            done = (iteration - first - 1) % check_every + 1
+            done = iteration - checked
             rate = done * settings.batch / max(now_s - checked_s, 1e-9)
             progress(Progress(iteration, share, loss_sum / done, state["best_percent"], rate))
-            checked_s, loss_sum = now_s, 0.0
+            checked, checked_s, loss_sum = iteration, now_s, 0.0
             state.update(
                 iteration=iteration,
                 elapsed_s=now_s - began_s,
@@ -187,6 +188,11 @@ def _share(iteration: int, elapsed_s: float, settings: Settings) -> float:
     """How much of the run is over, 0 to 1: by iterations, or by time where a budget is set and ends first."""
     share = iteration / settings.iterations
     return share if settings.minutes is None else max(share, elapsed_s / (60.0 * settings.minutes))
+
+
+def _checks_due(share: float) -> int:
+    """How many looks at the validation error belong to a run that is over by `share`."""
+    return math.floor(min(share, 1.0) * CHECKS + 1e-9)
 
 
 def _resumed(resume: Path, identity: dict[str, Any]) -> dict[str, Any]:
