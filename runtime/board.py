@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, Tripped
 from modsoft.runtime.fit import check_board
 from modsoft.runtime.link import HELLO_WAIT_S, RESETS, Link, Phase, fault_names, refusal
-from modsoft.runtime.ports import open_port
+from modsoft.runtime.ports import READ_WAIT_S, open_port
 from modsoft.runtime.protocol import (
     CHANNELS,
     PROTOCOL_HASH,
@@ -70,6 +70,7 @@ class Board:
         self._clock = clock
         self._link = Link(clock())
         self._dtr = True
+        self._away = False  # closed for the time of a reset
         self._p_max = 0
         self._changed = threading.Condition()  # guards the link
         self._stop = threading.Event()
@@ -296,7 +297,11 @@ class Board:
     def _pump(self) -> bool:
         """One turn: what came, what has to go. False when the port failed."""
         try:
-            data = self._port.read(max(1, self._port.in_waiting))
+            data = b""
+            if self._away:
+                self._stop.wait(READ_WAIT_S)
+            else:
+                data = self._port.read(max(1, self._port.in_waiting))
             with self._changed:
                 now = self._clock()
                 if data:
@@ -319,12 +324,17 @@ class Board:
         """Reset the board: DTR down, then up."""
         self._dtr = level
         try:
-            self._port.dtr = level
+            if not self._away:
+                self._port.dtr = level
+                return
         except OSError:
-            # A pseudo-terminal has no such line; what stands behind it takes the opening as the reset.
-            if level:
-                self._port.close()
-                self._port.open()
+            pass
+        # A pseudo-terminal has no such line; what stands behind it takes closing and opening for it.
+        self._away = not level
+        if level:
+            self._port.open()
+        else:
+            self._port.close()
 
     def _shut(self) -> None:
         self._stop.set()

@@ -19,11 +19,10 @@ class FuzzResult(ctypes.Structure):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_damaged_frames_are_never_taken(fast, kind, record_property):
+def test_damaged_frames_are_never_taken(fast, kind):
     result = FuzzResult()
     fast.fuzz_parser(ctypes.c_uint64(11), KINDS[kind], 1_000_000, ctypes.byref(result))
-    record_property("sent", result.sent)
-    record_property("unchanged", result.unchanged)
+    print(f"{kind}: {result.sent} damaged frames, {result.unchanged} of them arrived whole, 0 allowed to differ")
     assert (result.sent, result.wrong, result.lost_after) == (1_000_000, 0, 0)
 
 

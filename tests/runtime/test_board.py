@@ -1,0 +1,156 @@
+"""The thread around the link, and the ports: what happens when the operating system says no."""
+
+from __future__ import annotations
+
+import errno
+import threading
+
+import pytest
+import serial
+
+from modsoft.runtime import ports, protocol
+from modsoft.runtime.board import Board
+from modsoft.runtime.errors import DeviceAbsent, LostInRun, PortBusy
+from modsoft.runtime.protocol import CHANNELS, PROTOCOL_HASH, Hello, State, Status
+
+HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 30000, 20000, 300, 1000)
+STATUS = Status(0, State.IDLE, 0, 7, 1, 0, (0,) * CHANNELS, (0,) * CHANNELS, 0, 0, 0, 5000)
+
+
+class ScriptedPort:
+    """Says HELLO at once and then a STATUS at every look, until it is told to fail."""
+
+    def __init__(self):
+        self.dtr = True
+        self.failure = None
+        self.said_hello = self.closed = False
+        self.written = 0
+        self.reader = None
+
+    @property
+    def in_waiting(self):
+        return 0
+
+    def read(self, size=1):
+        self.reader = threading.current_thread()
+        if self.failure is not None:
+            raise self.failure
+        assert not self.closed, "read after close"
+        if not self.said_hello:
+            self.said_hello = True
+            return protocol.encode(HELLO)
+        return protocol.encode(STATUS)
+
+    def write(self, data):
+        if self.failure is not None:
+            raise self.failure
+        self.written += len(data)
+        return len(data)
+
+    def open(self):
+        raise AssertionError("never opened twice")
+
+    def close(self):
+        self.closed = True
+
+
+def test_thread_serves_and_ends():
+    port = ScriptedPort()
+    with Board(port) as board:
+        assert board.hello == HELLO
+        assert port.reader.name == "board"
+    assert port.closed
+    assert not port.reader.is_alive()
+    assert port.written > 0
+
+
+@pytest.mark.parametrize("failure", [OSError(5, "Input/output error"), serial.SerialTimeoutException("Write timeout")])
+def test_failing_port_is_a_lost_board_and_wakes_who_waits(failure):
+    port = ScriptedPort()
+    board = Board(port)
+    port.failure = failure
+    port.reader.join(1.0)
+    assert not port.reader.is_alive()
+    with pytest.raises(LostInRun, match="the port failed"):
+        board.check()
+    assert board.vent() is False
+    assert board.close() is False
+    assert port.closed
+
+
+def test_port_that_fails_before_hello():
+    port = ScriptedPort()
+    port.failure = OSError(5, "Input/output error")
+    with pytest.raises(DeviceAbsent, match="the port failed"):
+        Board(port)
+    assert port.closed
+
+
+# ---- ports
+
+
+def serial_error(number, text=""):
+    error = serial.SerialException(number, text)
+    error.errno = number
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "says"),
+    [
+        (serial_error(errno.ENOENT), DeviceAbsent, "no such port"),
+        (serial_error(errno.EACCES), PortBusy, "adduser"),
+        (serial_error(errno.EAGAIN), PortBusy, "in use by another program"),
+        (serial_error(errno.EBUSY), PortBusy, "in use by another program"),
+        (serial.SerialException("could not open port 'COM3': FileNotFoundError(2, ...)"), DeviceAbsent, "no such port"),
+        (serial.SerialException("could not open port 'COM3': PermissionError(13, ...)"), PortBusy, "in use"),
+        (serial_error(errno.ENOTTY, "not a tty"), DeviceAbsent, "no serial port"),
+        (ValueError("Invalid baud rate"), DeviceAbsent, "Invalid baud rate"),
+    ],
+)
+def test_each_refusal_is_one_line_that_says_what_to_do(monkeypatch, error, kind, says):
+    def refuse(*arguments, **options):
+        raise error
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(kind, match=says) as caught:
+        ports.open_port("/dev/ttyACM9", 250000)
+    assert "/dev/ttyACM9" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_port_names_those_that_are_there(monkeypatch):
+    monkeypatch.setattr(ports, "list_ports", lambda: [MEGA])
+    with pytest.raises(DeviceAbsent, match=r"ports here: /dev/serial/by-id/usb-mega 2341:0042 .*MEGA"):
+        ports.open_port("/dev/does-not-exist", 250000)
+
+
+MEGA = ports.PortInfo("/dev/serial/by-id/usb-mega", "/dev/ttyACM0", "Arduino", 0x2341, 0x0042, "75")
+
+
+class FakePort:
+    def __init__(self, device, vid=None, pid=None):
+        self.device, self.description, self.vid, self.pid, self.serial_number = device, "some port", vid, pid, "1"
+
+
+def test_ports_are_listed_megas_first_and_by_their_lasting_name(monkeypatch, tmp_path):
+    devices = [tmp_path / name for name in ("ttyS0", "ttyUSB0", "ttyACM0")]
+    for device in devices:
+        device.touch()
+    by_id = tmp_path / "by-id"
+    by_id.mkdir()
+    (by_id / "usb-Arduino_MEGA").symlink_to(devices[2])
+    identities = ((None, None), (0x0403, 0x6001), (0x2A03, 0x42))
+    found = [FakePort(str(device), *identity) for device, identity in zip(devices, identities, strict=True)]
+    monkeypatch.setattr(ports.serial_list_ports, "comports", lambda: found)
+    monkeypatch.setattr(ports, "BY_ID", by_id)
+    mega, adapter, plain = ports.list_ports()
+    assert (mega.name, mega.device, mega.is_mega) == (str(by_id / "usb-Arduino_MEGA"), str(devices[2]), True)
+    assert (adapter.name, adapter.is_mega) == (str(devices[1]), False)
+    assert plain.name == str(devices[0])
+    assert "0403:6001" in str(adapter)
+
+
+def test_no_port_at_all(monkeypatch):
+    monkeypatch.setattr(ports, "list_ports", list)
+    assert "is it plugged in?" in ports.ports_here()
