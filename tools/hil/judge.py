@@ -25,7 +25,7 @@ FEWEST_TICKS = 100  # below it a 99th percentile says nothing
 MISSED_TICKS = 0
 HELD_TICKS = 0
 LATENESS_P99_MS = 20.0
-ACKNOWLEDGED_P99_MS = 50.0
+ACKNOWLEDGED_P99_MS = 30.0
 VALVE_COUNTS = 1.0  # of the timer: a set-point is rounded to counts once
 DROPPED_BYTES = 0
 CHAMBERS_AT_END_BAR = 0.02
@@ -170,7 +170,8 @@ def measured_off_deg(record: Record) -> Array:
 
 def at_most(name: str, found: float, limit: float, unit: str = "", timing: bool = False) -> Acceptance:
     """A line that holds when found <= limit; NaN never holds."""
-    return Acceptance(name, f"{found:.4g}{unit}", f"<= {limit:g}{unit}", bool(found <= limit), timing)
+    words = f"at most {limit:g}{unit}" if limit else "0"
+    return Acceptance(name, f"{found:.3g}{unit}", words, bool(found <= limit), timing)
 
 
 def acceptances(record: Record) -> list[Acceptance]:
@@ -192,7 +193,7 @@ def acceptances(record: Record) -> list[Acceptance]:
         Acceptance(
             "lateness of a tick, 99th percentile",
             f"{late_ms:.2f} ms",
-            f"< {LATENESS_P99_MS:g} ms",
+            f"below {LATENESS_P99_MS:g} ms",
             late_ms < LATENESS_P99_MS,
             True,
         ),
