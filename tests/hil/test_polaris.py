@@ -1,6 +1,10 @@
 """The fake tracker: its protocol without a line, and what the faults do."""
 
+import json
 import struct
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -9,6 +13,8 @@ from hypothesis import strategies as st
 
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.polaris_device import Polaris, crc16, quaternion
+from modsoft.runtime.errors import DeviceAbsent
+from modsoft.runtime.ndi import NDI
 
 
 def framed(command: str) -> bytes:
@@ -201,3 +207,110 @@ def test_tool_files_are_told_apart(tmp_path):
     paths = write_tool_files(tmp_path, 3)
     assert [path.name for path in paths] == ["base.rom", "module-1.rom", "module-2.rom"]
     assert len({path.read_bytes() for path in paths}) == 3
+
+
+# ---- The unmodified client on the real line ------------------------------------------------------------------------
+
+
+class Rig:
+    """The process, and a source connected to it."""
+
+    def __init__(self, folder, tools=4, *options):
+        self.link = folder / "ttyPolaris"
+        self.tools = write_tool_files(folder, tools)
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "modsoft.hil.polaris", "--link", str(self.link), *options],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert json.loads(self.process.stdout.readline())["event"] == "ready"
+
+    def send(self, **line):
+        self.process.stdin.write(json.dumps(line) + "\n")
+        self.process.stdin.flush()
+
+    def connect(self):
+        return NDI("polaris", str(self.link), self.tools, len(self.tools))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.stdin.close()
+        self.process.wait(5)
+        self.process.stdout.close()
+
+
+def read_until(source, condition, reads=200):
+    """The first frame that fulfils the condition."""
+    for _ in range(reads):
+        frame = source.read()
+        if frame is not None and condition(frame):
+            return frame
+    raise AssertionError(f"no such frame in {reads} reads")
+
+
+# The client asks a "Rev 009" for the binary answer, which it cannot carry; the runtime asks for text in any case.
+@pytest.mark.parametrize("firmware", ["Polaris Spectra Rev 009", "Polaris Spectra Rev 007"])
+@pytest.mark.parametrize("tools", [3, 4, 9])
+def test_real_client_reads_what_is_shown(tmp_path, firmware, tools):
+    with Rig(tmp_path, tools, "--firmware", firmware) as rig:
+        shown = np.array(poses(tools))
+        angle = np.radians(30.0)
+        shown[1, :3, :3] = [
+            [np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]
+        ]  # fmt: skip
+        rig.send(poses=shown.tolist())
+        source = rig.connect()
+        frame = read_until(source, lambda frame: frame.valid.all())
+        np.testing.assert_allclose(frame.poses, shown, atol=2e-4)
+        np.testing.assert_allclose(frame.quality, 0.1)
+        later = read_until(source, lambda frame: True)
+        assert later.device_frame > frame.device_frame
+        assert later.monotonic_s > frame.monotonic_s
+        source.close()
+
+
+def test_real_client_sees_the_faults(tmp_path):
+    with Rig(tmp_path) as rig:
+        rig.send(poses=poses(4))
+        source = rig.connect()
+        read_until(source, lambda frame: frame.valid.all())
+        rig.send(hide=[2])
+        hidden = read_until(source, lambda frame: not frame.valid.all())
+        assert hidden.valid.tolist() == [True, True, False, True]
+        assert np.isnan(hidden.poses[2, :3, :]).all()
+        assert np.isnan(hidden.quality[2])
+        rig.send(hide=[], lose=[3])
+        lost = read_until(source, lambda frame: not frame.valid[3])
+        assert lost.device_frame > hidden.device_frame  # a tool that is left out does not set the number back
+        rig.send(lose=[])
+        number = read_until(source, lambda frame: frame.valid.all()).device_frame
+        rig.send(freeze=True)
+        while (frame := source.read()) is not None:  # what was on the line already
+            number = frame.device_frame
+        assert [source.read() for _ in range(5)] == [None] * 5
+        rig.send(freeze=False)
+        assert read_until(source, lambda frame: True).device_frame > number
+        rig.send(unplug=True)
+        with pytest.raises(DeviceAbsent, match="tracker at"):
+            read_until(source, lambda frame: False)
+        source.close()
+
+
+def test_real_client_comes_again(tmp_path):
+    with Rig(tmp_path) as rig:
+        rig.send(poses=poses(4))
+        for _ in range(2):
+            source = rig.connect()
+            read_until(source, lambda frame: frame.valid.all())
+            source.close()
+
+
+@pytest.mark.realtime
+def test_a_mute_device_is_an_error_not_a_hang(tmp_path):
+    with Rig(tmp_path) as rig:
+        rig.send(mute=True)
+        began = time.monotonic()
+        with pytest.raises(DeviceAbsent, match="no polaris tracker answers"):
+            rig.connect()
+        assert time.monotonic() - began < 15

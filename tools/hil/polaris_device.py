@@ -139,6 +139,7 @@ class Polaris:
     def _ascii(self, name: str, parameters: str) -> str:
         if name == "INIT":
             self._initialised, self.tracking = True, False
+            self._tools.clear()  # the client counts on that when it connects again
             return "OKAY"
         if name == "GETINFO":
             return f"{parameters}=009.000;1;0;1;;;{parameters}"

@@ -1,0 +1,179 @@
+"""The slot, the reading thread, recorded frames, and what is said when a tracker is missing."""
+
+import json
+import threading
+from itertools import count
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from modsoft.runtime import ndi
+from modsoft.runtime import robot as robots
+from modsoft.runtime.errors import DeviceAbsent, UsageError
+from modsoft.runtime.tracker import Frame, Reader, Replay, Slot, open_source
+
+ROBOT = robots.load("pneumatic-3")
+
+
+def frame(number: int, at_s: float = 0.0, tools: int = 4) -> Frame:
+    return Frame(number, at_s, np.tile(np.eye(4), (tools, 1, 1)), np.ones(tools, bool), np.full(tools, 0.1))
+
+
+def test_slot_holds_the_newest_and_counts_the_rest():
+    slot = Slot()
+    assert slot.latest() is None
+    for number in (5, 6, 6, 4, 9):
+        slot.put(frame(number))
+    assert slot.latest().device_frame == 9
+    assert slot.counts == {"received": 3, "repeated": 1, "backwards": 1}
+
+
+def test_a_repeated_frame_does_not_become_younger():
+    slot = Slot()
+    slot.put(frame(5, at_s=1.0))
+    slot.put(frame(5, at_s=2.0))
+    assert slot.latest().monotonic_s == 1.0
+
+
+@given(st.lists(st.integers(0, 20)))
+def test_the_slot_never_goes_back(numbers):
+    slot = Slot()
+    seen = []
+    for number in numbers:
+        slot.put(frame(number))
+        seen.append(slot.latest().device_frame)
+    assert seen == list(np.maximum.accumulate(np.array(numbers, dtype=int)))
+    assert sum(slot.counts.values()) == len(numbers)
+
+
+class Scripted:
+    """A source that gives these frames, then what `then` does."""
+
+    def __init__(self, frames, then=lambda: None):
+        self.frames, self.then = iter(frames), then
+        self.given = threading.Event()
+        self.closed_by = None
+
+    def read(self):
+        try:
+            return next(self.frames)
+        except StopIteration:
+            self.given.set()
+            threading.Event().wait(0.001)
+            return self.then()
+
+    def close(self):
+        self.closed_by = threading.current_thread().name
+
+
+def test_reader_reads_and_closes_in_its_own_thread():
+    source, slot = Scripted([frame(1), None, frame(2)]), Slot()
+    reader = Reader(source, slot)
+    assert source.given.wait(5)
+    reader.close()
+    assert slot.latest().device_frame == 2
+    assert slot.error is None
+    assert source.closed_by == "tracker"
+
+
+def test_reader_keeps_the_error_that_ended_it():
+    def fail():
+        raise OSError("cable")
+
+    source, slot = Scripted([frame(1)], fail), Slot()
+    Reader(source, slot).close()
+    assert str(slot.error) == "cable"
+    assert slot.latest().device_frame == 1
+    assert source.closed_by == "tracker"
+
+
+def test_closing_does_not_wait_for_a_mute_device():
+    never = threading.Event()
+    reader = Reader(Scripted([], never.wait), Slot())
+    reader.close()  # within CLOSE_WAIT_S, or the time-out of this test says so
+    never.set()
+
+
+def recorded(tmp_path, numbers, period_s=0.4):
+    lines = [{"event": "start"}]
+    for step, number in enumerate(numbers):
+        seen = frame(number)
+        line = {"tick": step, "frame": None}
+        if number is not None:
+            line["frame"] = {
+                "number": number, "mono_ns": round(step * period_s * 1e9), "poses": seen.poses.tolist(),
+                "valid": seen.valid.tolist(), "quality": [0.1, None, 0.1, 0.1],
+            }  # fmt: skip
+        lines.append(line)
+    text = "\n".join(json.dumps(line) for line in lines)
+    (tmp_path / "run.jsonl").write_text(text + '\n{"tick": 9, "fra')
+    return tmp_path
+
+
+def test_replay_gives_the_frames_at_their_pace(tmp_path):
+    clock = [100.0]
+
+    def wait(seconds):
+        assert 0 < seconds <= 0.05
+        clock[0] += seconds
+
+    source = Replay(recorded(tmp_path, [7, None, 9]), lambda: clock[0], wait)
+    got = []
+    for _ in count():
+        seen = source.read()
+        if seen is not None:
+            got.append((round(clock[0] - 100.0, 6), seen.device_frame))
+        if clock[0] > 102:
+            break
+    assert got == [(0.0, 7), (0.8, 9)]
+    assert np.isnan(seen.quality[1]) if seen else True
+
+
+def test_replay_of_nothing(tmp_path):
+    with pytest.raises(DeviceAbsent, match=r"cannot be read.*give a run's folder"):
+        Replay(tmp_path)
+    (tmp_path / "run.jsonl").write_text("{}\n")
+    with pytest.raises(DeviceAbsent, match="no frame"):
+        Replay(tmp_path)
+
+
+def with_tracker(**changes):
+    table = ROBOT.to_dict()
+    table["tracker"].update(changes)
+    return robots.from_dict(table)
+
+
+def test_what_was_not_told_is_named(tmp_path):
+    with pytest.raises(UsageError, match="--tracker-port"):
+        open_source(ROBOT, "", [])
+    with pytest.raises(UsageError, match="--tracker-port"):
+        open_source(with_tracker(source="replay"), "", [])
+    with pytest.raises(UsageError, match=r"0 tool.*needs 4.*--tool"):
+        open_source(ROBOT, "/dev/null", [])
+    with pytest.raises(UsageError, match="igtl"):
+        open_source(with_tracker(source="igtl"), "x", [])
+
+
+def test_what_is_not_there_is_named(tmp_path):
+    tools = [tmp_path / f"{n}.rom" for n in range(4)]
+    with pytest.raises(DeviceAbsent, match=r"0\.rom does not exist"):
+        open_source(ROBOT, "/dev/null", tools)
+    for path in tools:
+        path.write_bytes(b"NDI")
+    with pytest.raises(DeviceAbsent, match="no such port"):
+        open_source(ROBOT, str(tmp_path / "ttyNONE"), tools)
+    with pytest.raises(DeviceAbsent, match="no polaris tracker answers at /dev/null"):
+        open_source(ROBOT, "/dev/null", tools)
+
+
+def test_the_missing_extra_is_named(tmp_path, monkeypatch):
+    import sys
+
+    tools = [tmp_path / f"{n}.rom" for n in range(4)]
+    for path in tools:
+        path.write_bytes(b"NDI")
+    monkeypatch.setitem(sys.modules, "ndicapy", None)
+    with pytest.raises(DeviceAbsent, match=r"pip install 'modsoft\[ndi\]'"):
+        ndi.NDI("polaris", "/dev/null", tools, 4)
