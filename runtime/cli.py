@@ -1,0 +1,112 @@
+"""`modsoft-runtime`: the console script of the lab PC."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.command import entry
+
+
+def _at_once(action: Any) -> Any:
+    """A click callback for an option that does one thing and ends the command."""
+
+    def callback(context: click.Context, parameter: click.Parameter, value: Any) -> None:
+        if value and not context.resilient_parsing:
+            action(value)
+            context.exit()
+
+    return callback
+
+
+def _print_ports(_: bool) -> None:
+    from modsoft.runtime.ports import list_ports  # --help does without pyserial
+
+    found = list_ports()
+    for port in found:
+        click.echo(port)
+    if not found:
+        click.echo("no serial port on this machine; is the board plugged in?", err=True)
+
+
+def _check_robot(name: str) -> None:
+    robot = robots.load(name)
+    click.echo(f"{name}: {robot.name}, {robot.robot.kind}, {robot.modules} modules, {robot.loop.hz:g} Hz")
+    if robot.valve is not None:
+        valve = robot.valve
+        click.echo(f"valves: {valve.model}, full scale {valve.full_scale_bar:g} bar, {valve.p_min_bar:g} to "
+                   f"{valve.p_max_bar:g} bar; is full_scale_bar what the label says?")  # fmt: skip
+    for chamber in robot.chambers:
+        click.echo(f"module {chamber.module} side {chamber.side}: channel {chamber.channel}")
+    click.echo("ok")
+
+
+@click.command("modsoft-runtime", context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
+@click.option("--port", default="", metavar="PORT",
+              help="Serial port of the board, such as /dev/ttyACM0 or COM3. [default: port under [serial] in the robot "
+                   "file]")  # fmt: skip
+@click.option("--robot", default="robot.toml", show_default=True, metavar="FILE|NAME",
+              help="Robot file, or a shipped robot.")  # fmt: skip
+@click.option("--model", default="model.onnx", show_default=True, metavar="FILE", type=click.Path(path_type=Path),
+              help="Controller, written by modsoft-export.")  # fmt: skip
+@click.option("--task", default="", metavar="NAME|FILE",
+              help="edge, down, or a .npy file of desired configurations (steps, modules, 3). [default: task under "
+                   "[loop] in the robot file]")  # fmt: skip
+@click.option("--steps", type=click.IntRange(1), metavar="N", help="Stop after the first N control steps.")
+@click.option("--tracker", default="", type=click.Choice(["", "ndi", "replay"]), metavar="ndi|replay",
+              help="Where frames come from. [default: source under [tracker] in the robot file]")  # fmt: skip
+@click.option("--tracker-port", default="", metavar="PORT",
+              help="Serial port of the tracker (vega: its address; replay: a run's folder). [default: port under "
+                   "[tracker] in the robot file]")  # fmt: skip
+@click.option("--tool", "tools", multiple=True, metavar="FILE", type=click.Path(path_type=Path),
+              help="Tool definition file, once for each tool: base, then module 1 to N. [default: tools under "
+                   "[tracker] in the robot file]")  # fmt: skip
+@click.option("--runs-dir", default="runs", show_default=True, metavar="FOLDER", type=click.Path(path_type=Path),
+              help="Where the log of each run is kept.")  # fmt: skip
+@click.option("--yes", is_flag=True, help="Arm without asking.")
+@click.option("--dry-run", is_flag=True, help="Everything but the board: no valve port is opened.")
+@click.option("--list-ports", is_flag=True, is_eager=True, expose_value=False, callback=_at_once(_print_ports),
+              help="List the serial ports of this machine, Arduino MEGAs first, and leave.")  # fmt: skip
+@click.option("--check", metavar="FILE", is_eager=True, expose_value=False, callback=_at_once(_check_robot),
+              help="Read a robot file, say what it means, and leave.")  # fmt: skip
+@click.option("--print-robot", metavar="NAME", is_eager=True, expose_value=False,
+              callback=_at_once(lambda name: click.echo(robots.text_of(name), nl=False)),
+              help="Print a shipped robot's file to start your own from, and leave: cable-4, cable-6, pneumatic-2, "
+                   "pneumatic-3.")  # fmt: skip
+@click.version_option(None, "-V", "--version", package_name="modsoft", prog_name="modsoft-runtime")
+def cli(**told: Any) -> None:
+    """Run one task on a modular soft robot: tracker in, valve pressures out, at a fixed rate.
+
+    Takes robot.toml and model.onnx from this folder, tracker and task from the robot file. Asks before it arms.
+    Ctrl-C, space, q or Esc vent the robot at any time.
+
+    \b
+    First steps:
+      modsoft-runtime --print-robot pneumatic-3 > robot.toml    then edit: valves, channels, tracker
+      modsoft-runtime --check robot.toml
+      modsoft-runtime --list-ports
+      modsoft-runtime --dry-run                                 everything but the valves
+      modsoft-runtime --port /dev/ttyACM0                       the task of the robot file
+      modsoft-runtime --port /dev/ttyACM0 --task edge --steps 50
+
+    \b
+    Exit codes:
+      0 done, valves vented    2 usage            64 robot file      65 model or data
+      69 device not there      70 internal error  74 lost in the run 75 port in use
+      76 board of another version or for other hardware
+      79 stopped by a limit, a fault or a stop key
+      130 Ctrl-C               143 SIGTERM        129 SIGHUP
+    """
+    from modsoft.runtime.session import Options, run  # --help does without numpy and onnxruntime
+
+    told["runs"] = told.pop("runs_dir")
+    run(Options(**told))
+
+
+main = entry(cli)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""A line of a terminal that is written over, by a thread of its own: a terminal that is halted (Ctrl-S) or gone must
+not halt the loop."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import TextIO
+
+PERIOD_S = 0.2
+
+
+class StatusLine:
+    """While entered, shows what `text()` says. Does nothing where `stream` is no terminal."""
+
+    def __init__(self, text: Callable[[], str], stream: TextIO):
+        self._text = text
+        self._stream = stream
+        self._done = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> StatusLine:
+        if self._stream.isatty():
+            self._thread = threading.Thread(target=self._run, name="status line", daemon=True)
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._done.set()
+        if self._thread is not None:
+            self._thread.join(2 * PERIOD_S)
+
+    def _run(self) -> None:
+        shown = ""
+        try:
+            while not self._done.wait(PERIOD_S):
+                text = self._text()
+                if text != shown:
+                    self._show(text)
+                    shown = text
+            self._stream.write("\n" if shown else "")
+            self._stream.flush()
+        except (OSError, ValueError):
+            pass  # the terminal is gone; the run is not
+
+    def _show(self, text: str) -> None:
+        width = shutil.get_terminal_size().columns - 1
+        self._stream.write(f"\r\x1b[K{text[:width]}")
+        self._stream.flush()

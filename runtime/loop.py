@@ -1,0 +1,186 @@
+"""The controller: one task, tick by tick, from the tracker's frame to the set-points of the valves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime.actuation import channel_pressures_bar, limited
+from modsoft.runtime.clock import Tick, Ticker
+from modsoft.runtime.configuration import Window, state_of
+from modsoft.runtime.errors import LostInRun
+from modsoft.runtime.protocol import CHANNELS, State, Status
+from modsoft.runtime.robot import Robot
+from modsoft.runtime.safety import FrameJudge, Guard, Judgement, check_actuation
+from modsoft.runtime.stop import Stop
+from modsoft.runtime.tally import Tally
+from modsoft.runtime.tracker import Frame, Slot
+
+Array = NDArray[np.float64]
+
+
+class Model(Protocol):
+    """What is used of `modsoft.runtime.controller.Controller`."""
+
+    @property
+    def history(self) -> int: ...
+    def actuate(self, features: Array) -> Array: ...
+
+
+class Valves(Protocol):
+    """What is used of `modsoft.runtime.board.Board` between arming and venting."""
+
+    @property
+    def status(self) -> Status | None: ...
+    @property
+    def status_age_s(self) -> float: ...
+    @property
+    def applied_bar(self) -> Array: ...
+    @property
+    def measured_bar(self) -> Array: ...
+    @property
+    def ack_latency_s(self) -> float | None: ...
+    @property
+    def statistics(self) -> dict[str, int]: ...
+    def check(self) -> None: ...
+    def set_pressures(self, tick: int, pressures_bar: Array) -> int: ...
+    def beat(self, tick: int) -> None: ...
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What a run consists of. `desired` (K, N, 3): configurations, row k is what step k aims at."""
+
+    robot: Robot
+    model: Model
+    desired: Array
+    slot: Slot
+    judge: FrameJudge
+    valves: Valves
+    ticker: Ticker
+    stop: Stop
+    log: Callable[[dict[str, Any]], None]
+    tally: Tally
+
+    def run(self, rest: Array) -> None:
+        """Runs the whole task from `rest` (N, 3), the configuration of the vented robot; the board is armed.
+
+        Returns one period after the last step. Whatever ends it earlier is raised; venting is the caller's.
+        """
+        robot, kind = self.robot, self.robot.robot.kind
+        guard = Guard(robot)
+        state = state_of(rest, kind)
+        applied = np.zeros((robot.modules, robot.action_size))
+        window = Window(self.model.history, state, robot.action_size)
+        # The history begins with actuation 0, so the robot is given it for one period before the first step.
+        bar = channel_pressures_bar(robot, applied, CHANNELS)
+        sequence = self.valves.set_pressures(0, bar)
+        self.ticker.start(robot.loop.period_s)
+        self.log({"event": "start", "mono_ns": _ns(self.ticker.now()), "commanded_bar": bar})
+        step = -1
+        while True:
+            tick = self.ticker.next(self._idle)
+            acknowledged = self._acknowledged(step, sequence)
+            guard.missed(min(tick.index, len(self.desired)) - step - 1)
+            for _ in range(tick.missed):  # the valves held what they had
+                window.observe(state)
+                window.applied(applied)
+            if tick.index >= len(self.desired):
+                self.log({"event": "done", "mono_ns": _ns(tick.start_s), "acknowledged": acknowledged})
+                return
+            step = tick.index
+            frame = self.slot.latest()
+            judged = self.judge.judge(frame, self.ticker.now())
+            guard.frame(judged)
+            desired = self.desired[step]
+            line = self._begun(tick, frame, judged, desired, acknowledged)
+
+            raw = None
+            actuation = applied  # held where there is no good frame
+            if judged.configuration is not None:
+                state = state_of(judged.configuration, kind)
+            window.observe(state)
+            if judged.configuration is not None:
+                raw = self.model.actuate(window.features(state_of(desired, kind)))
+                check_actuation(raw)
+                actuation = limited(raw, applied, robot.limits.largest_actuation_step)
+            bar = channel_pressures_bar(robot, actuation, CHANNELS)
+            sent = not self.ticker.too_late(step)
+            if sent:
+                sequence = self.valves.set_pressures(step + 1, bar)
+                applied = actuation
+                guard.on_time()
+            else:
+                self.valves.beat(step + 1)
+                guard.missed(1)
+            window.applied(applied)
+            line |= {"sent": sent, "raw": raw, "actuation": applied, "commanded_bar": bar if sent else None}
+            line["step_ms"] = (self.ticker.now() - tick.start_s) * 1e3
+            self.log(line)
+            self.tally.add(line, tick, judged)
+
+    def _idle(self) -> None:
+        """Between two ticks: whether anybody wants to stop, and whether everybody is still there."""
+        self.stop.check()
+        self.valves.check()
+        if self.slot.error is not None:
+            raise LostInRun(f"tracker lost: {self.slot.error}; check its cable and start again")
+
+    def _acknowledged(self, step: int, sequence: int) -> dict[str, Any]:
+        """Whether the board has the set-points of `step`, and how long it took to say so."""
+        status, latency_s = self.valves.status, self.valves.ack_latency_s
+        known = status is not None and status.acked_seq == sequence and latency_s is not None
+        told = {"tick": step, "ms": latency_s * 1e3 if known and latency_s is not None else None}
+        if step >= 0:
+            self.tally.acknowledged(told["ms"])
+        return told
+
+    def _begun(
+        self, tick: Tick, frame: Frame | None, judged: Judgement, desired: Array, acknowledged: dict[str, Any]
+    ) -> dict[str, Any]:
+        """The first half of a tick's line of the log: what was known before anything was decided."""
+        seen = None
+        if frame is not None:
+            seen = {
+                "number": frame.device_frame,
+                "mono_ns": _ns(frame.monotonic_s),
+                "age_ms": None if judged.age_s is None else judged.age_s * 1e3,
+                "poses": frame.poses,
+                "valid": frame.valid,
+                "quality": frame.quality,
+            }
+        status, board = self.valves.status, None
+        if status is not None:
+            board = {
+                "state": State(status.state).name if status.state in set(State) else str(status.state),
+                "faults": status.faults,
+                "tick": status.tick,
+                "applied_bar": self.valves.applied_bar,
+                "measured_bar": self.valves.measured_bar,
+                "age_ms": self.valves.status_age_s * 1e3,
+            }
+        return {
+            "tick": tick.index,
+            "mono_ns": _ns(tick.start_s),
+            "due_ns": _ns(tick.due_s),
+            "wall": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "late_ms": tick.lateness_s * 1e3,
+            "missed": tick.missed,
+            "verdict": judged.word,
+            "detail": judged.detail,
+            "frame": seen,
+            "configuration": judged.configuration,
+            "desired": desired,
+            "board": board,
+            "acknowledged": acknowledged,
+            "link": self.valves.statistics,
+        }
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)

@@ -1,0 +1,200 @@
+"""What is refused, what is waited out, and when the run ends: frames, missed ticks, and the model's answers."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime.configuration import from_poses
+from modsoft.runtime.errors import LostInRun, ModelError, ModsoftError, Tripped
+from modsoft.runtime.robot import Robot
+from modsoft.runtime.tracker import Frame
+
+Array = NDArray[np.float64]
+
+MISSED_IN_A_ROW = 2  # skipped ticks that are waited out; the board's own timer vents after 1 s
+RAW_LIMIT = 3.0  # the actuation runs from -1 to 1: a network that answers this far out extrapolates
+BASELINE_S = 60.0  # over which the device's count is compared with the host's clock: 100 ppm make 6 ms of it
+NOISE_DEG = 5.0  # marker noise on top of the fastest motion
+STRETCH = 1.3  # a module's end is never further from the end before it than at rest, but for this
+STRETCH_MM = 10.0
+SIZE_TOLERANCE = 0.02  # of the length of a rotation's third axis
+REST_LIMIT_DEG = 60.0
+
+# Why a frame is not used. With the first group the tracker is as good as gone.
+NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED = "no frame", "stale", "frozen", "backwards", "delayed"
+WRONG_NUMBER, HIDDEN, NOT_FINITE, DISTORTED = "wrong number of tools", "tool hidden", "not finite", "distorted"
+SWAPPED, JUMP = "tools too far apart", "jump"
+GOOD = "good"
+GONE = (NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED)
+
+
+class Judgement(NamedTuple):
+    """What a frame is good for: its configuration (N, 3) if `word` is "good", else None."""
+
+    word: str
+    configuration: Array | None = None
+    age_s: float | None = None
+    detail: str = ""
+
+    @property
+    def good(self) -> bool:
+        return self.word == GOOD
+
+
+class FrameJudge:
+    """Judges the newest frame at every tick; remembers the last good one.
+
+    The gate on jumps: over the whole range of the actuation a module bends through half a turn at most, twice that for
+    the swing, so in one period it moves by 180 degrees times the largest actuation step at most.
+    """
+
+    def __init__(self, robot: Robot):
+        self.robot = robot
+        self._deg_per_s = 180.0 * robot.limits.largest_actuation_step / robot.loop.period_s
+        self._used: Frame | None = None
+        self._used_configuration: Array | None = None
+        self._rest_mm: Array | None = None
+        self._offsets: deque[tuple[float, float]] = deque()  # (host's time, host's time - device's time)
+
+    def judge(self, frame: Frame | None, now_s: float) -> Judgement:
+        """Judges the newest frame at `now_s`, seconds of the monotonic clock."""
+        if frame is None:
+            return Judgement(NO_FRAME)
+        age_s = now_s - frame.monotonic_s
+        word, detail, configuration = self._order(frame, age_s)
+        if word == GOOD:
+            word, detail, configuration = self._content(frame)
+        if word != GOOD:
+            return Judgement(word, None, age_s, detail)
+        if self._rest_mm is None:
+            self._rest_mm = _lengths_mm(frame)
+        self._used, self._used_configuration = frame, configuration
+        return Judgement(GOOD, configuration, age_s)
+
+    def _order(self, frame: Frame, age_s: float) -> tuple[str, str, None]:
+        """Whether the frame is of this period: by the device's number first, then by age and by delay."""
+        delay_s = self._delay_s(frame)
+        limit_s = self.robot.limits.tracker_age_s
+        if self._used is not None and frame.device_frame < self._used.device_frame:
+            return BACKWARDS, f"frame {frame.device_frame} after {self._used.device_frame}", None
+        if age_s > limit_s:
+            return STALE, f"{age_s:.2f} s old, at most {limit_s:g} s", None
+        if self._used is not None and frame.device_frame == self._used.device_frame:
+            return FROZEN, f"frame {frame.device_frame} again", None
+        if age_s + delay_s > limit_s:
+            return DELAYED, f"{age_s + delay_s:.2f} s old by the device's count, at most {limit_s:g} s", None
+        return GOOD, "", None
+
+    def _delay_s(self, frame: Frame) -> float:
+        """How much later this frame came than the promptest one of the last minute, by the device's count."""
+        if frame.device_hz is None:
+            return 0.0
+        offset_s = frame.monotonic_s - frame.device_frame / frame.device_hz
+        while self._offsets and self._offsets[0][0] < frame.monotonic_s - BASELINE_S:
+            self._offsets.popleft()
+        promptest_s = min((offset for _, offset in self._offsets), default=offset_s)
+        if offset_s - promptest_s <= self.robot.limits.tracker_age_s:  # a delayed device sets no new baseline
+            self._offsets.append((frame.monotonic_s, offset_s))
+        return max(0.0, offset_s - promptest_s)
+
+    def _content(self, frame: Frame) -> tuple[str, str, Array | None]:
+        count = self.robot.modules + 1
+        if frame.poses.shape != (count, 4, 4) or len(frame.valid) != count:
+            return WRONG_NUMBER, f"{len(frame.poses)}, expected {count}", None
+        if not frame.valid.all():
+            return HIDDEN, _tool_name(int(np.argmin(frame.valid))), None
+        if not np.isfinite(frame.poses).all():
+            return NOT_FINITE, _tool_name(int(np.argmin(np.isfinite(frame.poses).all(axis=(1, 2))))), None
+        configuration = from_poses(frame.poses)
+        size = np.linalg.norm(configuration, axis=-1)
+        if np.any(np.abs(size - 1.0) > SIZE_TOLERANCE):
+            return DISTORTED, _tool_name(int(np.argmax(np.abs(size - 1.0))) + 1), None
+        if self._rest_mm is not None:
+            over = _lengths_mm(frame) - (STRETCH * self._rest_mm + STRETCH_MM)
+            if np.any(over > 0):
+                worst = int(np.argmax(over))
+                return SWAPPED, f"{_tool_name(worst)} and {_tool_name(worst + 1)}", None
+        if self._used is not None and self._used_configuration is not None:
+            moved = _angle_deg(configuration, self._used_configuration)
+            allowed = self._deg_per_s * (frame.monotonic_s - self._used.monotonic_s) + NOISE_DEG
+            if np.any(moved > allowed):
+                worst = int(np.argmax(moved))
+                return JUMP, f"module {worst + 1} by {moved[worst]:.0f} degrees, at most {allowed:.0f}", None
+        return GOOD, "", configuration
+
+
+class Guard:
+    """Counts what is waited out, and raises when it has gone on for too long."""
+
+    def __init__(self, robot: Robot):
+        self._invalid_frames = robot.limits.invalid_frames
+        self.bad_frames = 0  # in a row
+        self.missed_ticks = 0  # in a row
+
+    def frame(self, judged: Judgement) -> None:
+        """Raises `LostInRun` or `Tripped` at the last frame in a row that the robot file allows to be bad."""
+        if judged.good:
+            self.bad_frames = 0
+            return
+        self.bad_frames += 1
+        if self.bad_frames >= self._invalid_frames:
+            kind: type[ModsoftError] = LostInRun if judged.word in GONE else Tripped
+            detail = f" ({judged.detail})" if judged.detail else ""
+            raise kind(
+                f"tracker: {self.bad_frames} ticks in a row without a good frame, the last one {judged.word}{detail}; "
+                "look at the tracker and the markers, then start again"
+            )
+
+    def missed(self, ticks: int) -> None:
+        """Counts skipped ticks; raises `Tripped` for more than two in a row."""
+        self.missed_ticks += ticks
+        if self.missed_ticks > MISSED_IN_A_ROW:
+            raise Tripped(
+                f"{self.missed_ticks} control ticks in a row were missed, at most {MISSED_IN_A_ROW} are waited out: "
+                "this computer is too busy, close other programs and start again"
+            )
+
+    def on_time(self) -> None:
+        """A command went out in its tick."""
+        self.missed_ticks = 0
+
+
+def check_actuation(raw: Array) -> None:
+    """Raises `ModelError` for an actuation (N, A) of the model that is not finite or far out of [-1, 1]."""
+    if not np.isfinite(raw).all():
+        raise ModelError(f"the model's actuation is not finite: {raw.tolist()}; nothing of it was sent")
+    if np.any(np.abs(raw) > RAW_LIMIT):
+        raise ModelError(
+            f"the model's actuation is {raw.ravel()[np.argmax(np.abs(raw))]:.3g}, expected about -1 to 1 and never "
+            f"beyond {RAW_LIMIT:g}; nothing of it was sent. Is this the model of this robot?"
+        )
+
+
+def check_rest(configuration: Array) -> None:
+    """Raises `Tripped` where the configuration (N, 3) is not that of a robot that hangs at rest."""
+    bent = np.degrees(np.arccos(np.clip(configuration[:, 2], -1.0, 1.0)))
+    if np.any(bent > REST_LIMIT_DEG):
+        worst = int(np.argmax(bent))
+        raise Tripped(
+            f"module {worst + 1} stands at {bent[worst]:.0f} degrees although the robot is vented, expected at most "
+            f"{REST_LIMIT_DEG:g}; are the tools in the order base, module 1, ... with z along the robot?"
+        )
+
+
+def _tool_name(tool: int) -> str:
+    return "base" if tool == 0 else f"module {tool}"
+
+
+def _lengths_mm(frame: Frame) -> Array:
+    """Distances (N,) from each tool to the next, mm."""
+    return np.linalg.norm(np.diff(frame.poses[:, :3, 3], axis=0), axis=-1)
+
+
+def _angle_deg(one: Array, other: Array) -> Array:
+    """Angles (N,) between unit vectors (N, 3), degrees."""
+    across = np.linalg.norm(np.cross(one, other), axis=-1)
+    return np.degrees(np.arctan2(across, np.sum(one * other, axis=-1)))

@@ -1,0 +1,261 @@
+"""One run from beginning to end: the order of start, and every way out.
+
+Order: robot file, model, task, tracker, warm-up of the model, and only then the valve port. Whatever happens from
+arming on, the valves are vented before anything else, and "vented" is only said after the board said so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime import log as logs
+from modsoft.runtime import robot as robots
+from modsoft.runtime.board import Board
+from modsoft.runtime.clock import Ticker
+from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.controller import Controller
+from modsoft.runtime.display import StatusLine
+from modsoft.runtime.errors import (
+    INTERNAL_EXIT_CODE,
+    DeviceAbsent,
+    LostInRun,
+    ModelError,
+    ModsoftError,
+    RobotFileError,
+    UsageError,
+)
+from modsoft.runtime.loop import Loop
+from modsoft.runtime.ports import ports_here
+from modsoft.runtime.protocol import VentMode
+from modsoft.runtime.rehearsal import Rehearsal
+from modsoft.runtime.robot import Robot
+from modsoft.runtime.safety import FrameJudge, check_rest
+from modsoft.runtime.stop import Keys, Signals, Stop, StopKey
+from modsoft.runtime.tally import Tally
+from modsoft.runtime.tracker import Reader, Slot, open_source
+from modsoft.runtime.trajectory import load_task
+
+Array = NDArray[np.float64]
+
+FIRST_FRAME_WAIT_S = 5.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line said; empty where the robot file decides."""
+
+    robot: str
+    model: Path
+    task: str
+    port: str
+    tracker: str
+    tracker_port: str
+    tools: tuple[Path, ...]
+    runs: Path
+    steps: int | None
+    yes: bool
+    dry_run: bool
+
+
+def run(options: Options) -> None:
+    """The whole run. Returns after the last step, with the valves vented by the board's own word (or after a dry run);
+    raises what ended it earlier."""
+    said = time.perf_counter()
+    robot, robot_text, beside = _robot(options)
+    port = options.port or robot.serial.port
+    if not options.dry_run:
+        _check_port(port)
+    controller, digest = _model(options.model, robot)
+    task = options.task or robot.loop.task
+    desired = _task(task, robot)[: options.steps]
+    tools = list(options.tools) or [beside / tool for tool in robot.tracker.tools]
+
+    stop = Stop()
+    keys = Keys(stop)
+
+    def leave(code: int) -> None:
+        keys.restore()
+        os._exit(code)
+
+    with ExitStack() as exits:
+        signals = exits.enter_context(Signals(stop, leave))
+        slot = Slot()
+        reader = Reader(open_source(robot, options.tracker_port or robot.tracker.port, tools), slot)
+        exits.callback(reader.close)
+        judge = FrameJudge(robot)
+        rest = _rest(slot, judge, stop)
+        controller.warm_up(robot.modules)
+        _say(f"robot {robot.name}, {robot.modules} modules, hangs at {_angles(rest)} degrees")
+        _say(f"model {options.model}, task {task}: {len(desired)} steps, {len(desired) * robot.loop.period_s:.0f} s")
+
+        board = None
+        if not options.dry_run:
+            board = Board.open(port, robot.serial.baud)
+            exits.callback(board.close)
+        _say(f"ready {time.perf_counter() - said:.1f} s after the start")
+        if board is not None and not options.yes:
+            _ask()
+        tally = Tally(robot, len(desired))
+        log = logs.RunLog(options.runs, robot.name, robot_text, {
+            "command": sys.argv[1:], "robot": robot.to_dict(), "task": task, "steps": len(desired),
+            "model": {"file": str(options.model), "sha256": digest, "description": _described(controller)},
+            "board": None if board is None else board.hello._asdict(), "port": port or None,
+        })  # fmt: skip
+        signals.hold()
+        exits.enter_context(keys)
+        error: BaseException | None = None
+        try:
+            if board is not None:
+                board.arm(robot)
+            rest = _rest(slot, judge, stop)
+            with StatusLine(lambda: _status(tally, log), sys.stderr):
+                Loop(
+                    robot, controller, desired, slot, judge, board or Rehearsal(),
+                    Ticker(robot.loop.period_s, time.monotonic, stop.wait), stop, log.put, tally,
+                ).run(rest)  # fmt: skip
+        except BaseException as raised:  # noqa: BLE001 - raised again below, after the venting
+            error = raised
+        finish(board, log, tally, slot, error)
+
+
+def finish(board: Board | None, log: logs.RunLog, tally: Tally, slot: Slot, error: BaseException | None) -> None:
+    """Vents, closes the log, says what came of the run, and raises what ended it, if anything did."""
+    began_ns = time.monotonic_ns()
+    vented = False
+    if board is not None:
+        try:
+            vented = board.vent(VentMode.DUMP if isinstance(error, StopKey) else VentMode.RAMP)
+        except Exception as failed:  # noqa: BLE001 - the log must still be closed; the board's own timer vents
+            error = error or failed
+        if not vented and error is None:
+            error = LostInRun("the task was done, but the board never said that it is vented; look at the pressures")
+    code, reason = 0, "done"
+    if error is not None:
+        code = error.exit_code if isinstance(error, ModsoftError) else INTERNAL_EXIT_CODE
+        reason = str(error) or type(error).__name__
+    log.put({"event": "end", "mono_ns": began_ns, "exit_code": code, "reason": reason, "vented": vented})
+    figures = {"figures": tally.figures(), "tracker": dict(slot.counts), "vented": vented}
+    log.close(code, reason, {**figures, "link": None if board is None else board.statistics})
+    if board is None:
+        word = "dry run, no valve was touched"
+    else:
+        word = "yes, said by the board" if vented else "NOT KNOWN, the board did not say so; look at the pressures"
+    for line in [*tally.summary(), f"valves vented: {word}", f"log: {log.folder}"]:
+        _say(line)
+    if log.trouble:
+        _say(f"log: {log.trouble}")
+    if error is not None:
+        raise error
+
+
+def _robot(options: Options) -> tuple[Robot, str, Path]:
+    """The robot with what the command line changes in it, its file's text, and the folder that its paths start from."""
+    path = Path(options.robot)
+    if not path.is_file() and options.robot == "robot.toml":
+        raise RobotFileError(
+            "no robot.toml in this folder; give --robot FILE, or make one to start from: "
+            "modsoft-runtime --print-robot pneumatic-3 > robot.toml"
+        )
+    robot = robots.load(options.robot)
+    if robot.robot.kind != "pneumatic":
+        raise RobotFileError(
+            f"robot {robot.name} is of kind {robot.robot.kind!r}, which is only simulated (modsoft-simulate); "
+            "modsoft-runtime drives pneumatic robots"
+        )
+    if options.tracker:
+        table = robot.to_dict()
+        table["tracker"]["source"] = options.tracker
+        robot = robots.from_dict(table, options.robot)
+    text = path.read_text(encoding="utf-8") if path.is_file() else robots.text_of(options.robot)
+    return robot, text, path.parent if path.is_file() else Path()
+
+
+def _check_port(port: str) -> None:
+    """Whether a port was told and is there, without opening it: that comes last."""
+    if not port:
+        raise UsageError(
+            f"the board's port is not told; give --port, or port under [serial] in the robot file; {ports_here()}"
+        )
+    if os.name == "posix" and not Path(port).exists():
+        raise DeviceAbsent(f"no board at {port}: no such port; {ports_here()}")
+
+
+def _model(path: Path, robot: Robot) -> tuple[Controller, str]:
+    """The controller, proven and of this robot, and its file's SHA-256."""
+    if not path.is_file():
+        raise ModelError(f"no model {str(path)!r} here; give --model FILE, a file that modsoft-export wrote")
+    controller = Controller.load(path)
+    controller.check(robot)
+    return controller, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _described(controller: Controller) -> dict[str, object]:
+    """What the model says about itself, without the golden pairs."""
+    said = msgspec.to_builtins(controller.description)
+    said.pop("golden", None)
+    return said
+
+
+def _task(task: str, robot: Robot) -> Array:
+    if not task:
+        raise UsageError("the task is not told; give --task, or task under [loop] in the robot file")
+    return load_task(task, robot)
+
+
+def _rest(slot: Slot, judge: FrameJudge, stop: Stop, now: Callable[[], float] = time.monotonic) -> Array:
+    """The configuration (N, 3) in which the vented robot hangs; waits for the tracker's first good frame."""
+    until_s = now() + FIRST_FRAME_WAIT_S
+    while True:
+        judged = judge.judge(slot.latest(), now())
+        if judged.configuration is not None:
+            check_rest(judged.configuration)
+            return judged.configuration
+        if slot.error is not None:
+            raise DeviceAbsent(f"tracker: {slot.error}")
+        if now() > until_s:
+            detail = f" ({judged.detail})" if judged.detail else ""
+            raise DeviceAbsent(
+                f"tracker: no good frame within {FIRST_FRAME_WAIT_S:.0f} s, the last one {judged.word}{detail}; "
+                "are all tools in view?"
+            )
+        stop.wait(0.01)
+        stop.check()
+
+
+def _ask() -> None:
+    """Arming is a person's decision."""
+    click.echo("Chambers at 0 bar? Nobody near the robot? Press Enter to arm, Ctrl-C to leave. ", err=True, nl=False)
+    try:
+        answered = sys.stdin.readline()
+    except (OSError, ValueError):
+        answered = ""
+    if not answered:
+        raise UsageError("arming asks for Enter, and there is nobody to press it; give --yes")
+
+
+def _status(tally: Tally, log: logs.RunLog) -> str:
+    return tally.status + (f"  LOG: {log.trouble}" if log.trouble else "")
+
+
+def _say(text: str) -> None:
+    """A line for the person at the terminal, who may have left."""
+    try:
+        click.echo(text, err=True)
+    except OSError:
+        pass
+
+
+def _angles(configuration: Array) -> str:
+    return ", ".join(f"{angle:.1f}" for angle in bending_angle_deg(configuration))

@@ -1,0 +1,172 @@
+"""What a person or the system does to end a run: signals and the stop keys. The first request wins and is obeyed by
+the loop; a second Ctrl-C or SIGTERM leaves at once, and then the board's own timer vents."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from types import FrameType, TracebackType
+from typing import Any
+
+from modsoft.runtime.errors import ModsoftError, Tripped
+
+STOP_KEYS = (" ", "q", "\x1b")  # space, q, Esc
+# SIGHUP does not exist on Windows.
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+class Interrupted(ModsoftError):
+    """A signal ended the run; the exit code is the shell's for that signal."""
+
+    def __init__(self, number: int):
+        super().__init__(f"stopped by {signal.Signals(number).name}")
+        self.exit_code = 128 + number
+
+
+class StopKey(Tripped):
+    """A person pressed a stop key."""
+
+
+class Stop:
+    """The one flag. `wait` is what the loop sleeps with, so that a request wakes it."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+        self.error: ModsoftError | None = None
+
+    def request(self, error: ModsoftError) -> None:
+        """Asks for the end; only the first reason is kept."""
+        if self.error is None:
+            self.error = error
+        self._event.set()
+
+    def wait(self, seconds: float) -> None:
+        self._event.wait(seconds)
+
+    def check(self) -> None:
+        """Raises what was asked for."""
+        if self.error is not None:
+            raise self.error
+
+
+class Signals:
+    """While entered, signals become requests.
+
+    Before `hold` a signal raises at once, wherever the program is: nothing is under pressure yet, and connecting to a
+    device can take seconds. From `hold` on it only sets the flag, so that venting is never cut short.
+    """
+
+    def __init__(self, stop: Stop, leave: Callable[[int], Any] = os._exit):
+        self._stop = stop
+        self._leave = leave
+        self._holding = False
+        self._asked = False
+        self._before: dict[int, Any] = {}
+
+    def hold(self) -> None:
+        self._holding = True
+
+    def __enter__(self) -> Signals:
+        for number in SIGNALS:
+            self._before[number] = signal.signal(number, self._on_signal)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        error = Interrupted(number)
+        if self._asked:
+            # A terminal that closes sends SIGHUP, and its shell a second one: that is nobody's impatience.
+            if number in (signal.SIGINT, signal.SIGTERM):
+                self._leave(error.exit_code)
+            return
+        self._asked = True
+        self._stop.request(error)
+        if not self._holding:
+            raise error
+
+
+class Keys:
+    """While entered, the stop keys of a terminal become requests. Nothing happens where stdin is no terminal, or one
+    that this process may not read from."""
+
+    def __init__(self, stop: Stop):
+        self._stop = stop
+        self._done = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._restore: Callable[[], None] | None = None
+
+    def __enter__(self) -> Keys:
+        read = self._posix() if os.name == "posix" else self._windows()
+        if read is not None:
+            self._thread = threading.Thread(target=self._run, args=(read,), name="keys", daemon=True)
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._done.set()
+        if self._thread is not None:
+            self._thread.join(1.0)
+        self.restore()
+
+    def restore(self) -> None:
+        """Gives the terminal back as it was."""
+        if self._restore is not None:
+            self._restore()
+
+    def _run(self, read: Callable[[], str]) -> None:
+        while not self._done.is_set():
+            if read() in STOP_KEYS:
+                self._stop.request(StopKey("stop key pressed"))
+                return
+
+    def _posix(self) -> Callable[[], str] | None:
+        import termios  # neither exists on Windows
+        import tty
+
+        try:
+            terminal = sys.stdin.fileno()
+            if not os.isatty(terminal) or os.tcgetpgrp(terminal) != os.getpgrp():
+                return None  # a background job that touched its terminal would be stopped
+            before = termios.tcgetattr(terminal)
+            tty.setcbreak(terminal)  # Ctrl-C stays a signal
+        except (OSError, ValueError, termios.error):
+            return None
+        self._restore = lambda: termios.tcsetattr(terminal, termios.TCSANOW, before)
+
+        def read() -> str:
+            if not select.select([terminal], [], [], 0.05)[0]:
+                return ""
+            try:
+                key = os.read(terminal, 1)
+            except OSError:
+                key = b""
+            if not key:  # the terminal is gone; SIGHUP tells so too
+                self._done.wait(0.05)
+            return key.decode("latin-1")
+
+        return read
+
+    def _windows(self) -> Callable[[], str] | None:
+        import msvcrt  # exists on Windows only
+
+        if not sys.stdin.isatty():
+            return None
+
+        def read() -> str:
+            if msvcrt.kbhit():  # type: ignore[attr-defined]
+                return str(msvcrt.getwch())  # type: ignore[attr-defined]
+            self._done.wait(0.05)
+            return ""
+
+        return read
