@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
 
 SLICE_S = 0.05  # waiting is cut into slices so that a lost device is noticed between two ticks
 
 
-class Tick(NamedTuple):
+@dataclass(frozen=True)
+class Tick:
     """A control step: slot `index`, due at `due_s`, begun at `start_s`, after `missed` skipped slots."""
 
     index: int

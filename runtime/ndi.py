@@ -63,7 +63,7 @@ class NDI:
             return None
         self._newest = number
         stack = np.asarray(poses, dtype=np.float64)
-        valid = np.isfinite(stack).all(axis=(1, 2))
+        valid = np.asarray(np.isfinite(stack).all(axis=(1, 2)))
         return Frame(number, asked_s, stack, valid, np.asarray(quality, dtype=np.float64), FRAME_HZ[self._kind])
 
     def close(self) -> None:

@@ -94,11 +94,11 @@ class FrameJudge:
         if frame.device_hz is None:
             return 0.0
         offset_s = frame.monotonic_s - frame.device_frame / frame.device_hz
-        while self._offsets and self._offsets[0][0] < frame.monotonic_s - BASELINE_S:
-            self._offsets.popleft()
         promptest_s = min((offset for _, offset in self._offsets), default=offset_s)
         if offset_s - promptest_s <= self.robot.limits.tracker_age_s:  # a delayed device sets no new baseline
             self._offsets.append((frame.monotonic_s, offset_s))
+            while self._offsets[0][0] < frame.monotonic_s - BASELINE_S:
+                self._offsets.popleft()
         return max(0.0, offset_s - promptest_s)
 
     def _content(self, frame: Frame) -> tuple[str, str, Array | None]:

@@ -94,8 +94,7 @@ def run(options: Options) -> None:
         slot = Slot()
         reader = Reader(open_source(robot, options.tracker_port or robot.tracker.port, tools), slot)
         exits.callback(reader.close)
-        judge = FrameJudge(robot)
-        rest = _rest(slot, judge, stop)
+        rest = _rest(slot, FrameJudge(robot), stop)
         controller.warm_up(robot.modules)
         _say(f"robot {robot.name}, {robot.modules} modules, hangs at {_angles(rest)} degrees")
         _say(f"model {options.model}, task {task}: {len(desired)} steps, {len(desired) * robot.loop.period_s:.0f} s")
@@ -119,6 +118,7 @@ def run(options: Options) -> None:
         try:
             if board is not None:
                 board.arm(robot)
+            judge = FrameJudge(robot)  # a new one: Enter may have been long in coming
             rest = _rest(slot, judge, stop)
             with StatusLine(lambda: _status(tally, log), sys.stderr):
                 Loop(

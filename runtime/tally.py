@@ -50,7 +50,7 @@ class Tally:
     def _status_line(self, line: dict[str, Any], tick: Tick, judged: Judgement) -> str:
         rate = "" if self._before_s is None else f"{1.0 / (tick.start_s - self._before_s):.2f} Hz  "
         seen = "no frame"
-        if line["frame"] is not None:
+        if line["frame"] is not None and judged.age_s is not None:
             valid = line["frame"]["valid"]
             seen = f"tracker {judged.age_s * 1e3:.0f} ms {int(np.sum(valid))}/{len(valid)}"
         if not judged.good:

@@ -1,0 +1,216 @@
+"""Which frames are used, what is waited out, and what ends a run."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime import safety
+from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.errors import LostInRun, ModelError, Tripped
+from modsoft.runtime.safety import FrameJudge, Guard, Judgement, check_actuation, check_rest
+from modsoft.runtime.tracker import Frame
+
+ROBOT = robots.load("pneumatic-3")
+PERIOD_S = ROBOT.loop.period_s
+MODULE_MM = 85.0
+
+
+def planar_poses(angles_deg, module_mm=MODULE_MM):
+    """Poses of a planar robot: module i ends `module_mm` further along the mean of its two ends' directions."""
+    poses = [np.eye(4)]
+    total, position = 0.0, np.zeros(3)
+    for angle in angles_deg:
+        middle = np.radians(total + angle / 2)
+        total += angle
+        position = position + module_mm * np.array([np.sin(middle), 0.0, np.cos(middle)])
+        pose = np.eye(4)
+        pose[:3, :3] = [
+            [np.cos(np.radians(total)), 0, np.sin(np.radians(total))],
+            [0, 1, 0],
+            [-np.sin(np.radians(total)), 0, np.cos(np.radians(total))],
+        ]
+        pose[:3, 3] = position
+        poses.append(pose)
+    return np.stack(poses)
+
+
+def frame(number, at_s, angles=(0.0, 0.0, 0.0), **changes):
+    poses = planar_poses(angles)
+    parts = {"poses": poses, "valid": np.ones(len(poses), bool), "quality": np.full(len(poses), 0.1), "device_hz": 60.0}
+    return Frame(number, at_s, **(parts | changes))
+
+
+def settled(start_s=100.0):
+    """A judge that has seen one good frame, number 6000 at `start_s`."""
+    judge = FrameJudge(ROBOT)
+    assert judge.judge(frame(6000, start_s), start_s + 0.02).good
+    return judge
+
+
+def test_a_good_frame_gives_its_configuration():
+    judged = FrameJudge(ROBOT).judge(frame(1, 100.0, (3.0, 30.0, -40.0)), 100.02)
+    assert judged.good
+    assert judged.age_s == pytest.approx(0.02)
+    np.testing.assert_allclose(bending_angle_deg(judged.configuration), [3.0, 30.0, -40.0])
+
+
+def one_nan(poses):
+    poses = poses.copy()
+    poses[2, 0, 0] = np.nan
+    return poses
+
+
+def stretched(poses):
+    poses = poses.copy()
+    poses[2, :3, :3] *= 1.1
+    return poses
+
+
+BAD = {
+    safety.NO_FRAME: lambda: None,
+    safety.STALE: lambda: frame(6010, 100.4 - 0.41),
+    safety.FROZEN: lambda: frame(6000, 100.3),
+    safety.BACKWARDS: lambda: frame(5999, 100.39),
+    safety.DELAYED: lambda: frame(6000 + 1, 100.39 + 0.05),
+    safety.WRONG_NUMBER: lambda: frame(6024, 100.39, (0.0, 0.0)),
+    safety.HIDDEN: lambda: frame(6024, 100.39, valid=np.array([True, True, False, True])),
+    safety.NOT_FINITE: lambda: frame(6024, 100.39, poses=one_nan(planar_poses((0.0, 0.0, 0.0)))),
+    safety.DISTORTED: lambda: frame(6024, 100.39, poses=stretched(planar_poses((0.0, 0.0, 0.0)))),
+    safety.SWAPPED: lambda: frame(6024, 100.39, poses=planar_poses((0.0, 10.0, 20.0))[[0, 2, 1, 3]]),
+    safety.JUMP: lambda: frame(6024, 100.39, (0.0, 0.0, 120.0)),
+}
+
+
+@pytest.mark.parametrize("word", BAD)
+def test_each_bad_frame_is_refused_by_name(word):
+    judge = settled()
+    judged = judge.judge(BAD[word](), 100.4 if word != safety.DELAYED else 100.79)
+    assert judged.word == word
+    assert judged.configuration is None
+    # and the next good one is used again
+    assert judge.judge(frame(6072, 101.19), 101.2).good
+
+
+@pytest.mark.parametrize(("word", "name"), [(safety.HIDDEN, "module 2"), (safety.NOT_FINITE, "module 2")])
+def test_the_tool_is_named(word, name):
+    assert settled().judge(BAD[word](), 100.4).detail == name
+
+
+def test_a_robot_as_fast_as_its_limits_allow_is_no_jump():
+    """The largest actuation step, over a reach of 90 degrees to each side, with half of it again as swing."""
+    judge = settled()
+    angle, sign = 0.0, 1.0
+    for step in range(1, 40):
+        if abs(angle) >= 90.0:
+            sign = -sign
+        angle += sign * 1.5 * 90.0 * ROBOT.limits.largest_actuation_step
+        now_s = 100.0 + step * PERIOD_S
+        judged = judge.judge(frame(6000 + 24 * step, now_s, (0.0, 0.0, angle)), now_s + 0.02)
+        assert judged.good, judged
+
+
+def test_a_frozen_tracker_is_found_within_three_ticks_whatever_the_phase():
+    for phase_s in np.linspace(0.0, PERIOD_S, 9):
+        judge, held = settled(), frame(6000 + round(60 * phase_s), 100.0 + phase_s)
+        words = [judge.judge(held, 100.0 + phase_s + 0.01 + k * PERIOD_S).word for k in range(3)]
+        assert words[1] != "good"
+        assert words[2] != "good"
+
+
+@pytest.mark.parametrize("drift", [-1e-4, 0.0, 1e-4])
+def test_no_false_alarm_in_an_hour_of_noise(drift):
+    """Half a millimetre and half a degree of noise, jitter of the line, a device clock that is 100 ppm off."""
+    rng = np.random.default_rng(1)
+    judge = FrameJudge(ROBOT)
+    for step in range(9000):
+        now_s = 1000.0 + step * PERIOD_S
+        age_s = rng.uniform(0.002, 0.045)
+        angles = np.array([5.0, 30.0, 80.0]) * np.sin(2 * np.pi * step / 200) + rng.normal(0, 0.5, 3)
+        poses = planar_poses(angles)
+        poses[:, :3, 3] += rng.normal(0, 0.5, (4, 3))
+        number = int((now_s - age_s - rng.uniform(0, 0.017)) * 60 * (1 + drift))
+        judged = judge.judge(frame(number, now_s - age_s, poses=poses), now_s)
+        assert judged.good, (step, judged)
+
+
+def test_a_delay_is_found_although_the_host_sees_fresh_frames():
+    judge = FrameJudge(ROBOT)
+    for step in range(10):
+        now_s = 100.0 + step * PERIOD_S
+        assert judge.judge(frame(int((now_s - 0.02) * 60), now_s - 0.01), now_s).good
+    now_s += PERIOD_S
+    delayed = judge.judge(frame(int((now_s - 0.02 - 0.35) * 60), now_s - 0.01), now_s)
+    assert delayed.good  # 0.36 s: within the robot file's 0.4 s
+    for _ in range(200):  # a delay that lasts does not become the norm
+        now_s += PERIOD_S
+        judged = judge.judge(frame(int((now_s - 0.02 - 0.45) * 60), now_s - 0.01), now_s)
+        assert judged.word == safety.DELAYED
+
+
+@given(
+    st.integers(0, 3),
+    st.sampled_from([(0, 0), (1, 3), (2, 2), (0, 3)]),
+    st.sampled_from([np.nan, np.inf, -np.inf]),
+)
+def test_what_is_not_finite_never_becomes_a_configuration(tool, entry, value):
+    poses = planar_poses((5.0, 30.0, 80.0))
+    poses[tool][entry] = value
+    judged = FrameJudge(ROBOT).judge(frame(1, 1.0, poses=poses), 1.01)
+    assert judged.word == safety.NOT_FINITE
+
+
+# ---- what is waited out
+
+
+def test_two_bad_frames_are_waited_out_and_the_third_ends_the_run():
+    guard = Guard(ROBOT)
+    for _ in range(5):
+        guard.frame(Judgement(safety.HIDDEN))
+        guard.frame(Judgement(safety.JUMP))
+        guard.frame(Judgement("good", np.zeros((3, 3))))
+    guard.frame(Judgement(safety.HIDDEN))
+    guard.frame(Judgement(safety.HIDDEN))
+    with pytest.raises(Tripped, match=r"3 ticks in a row.*tool hidden \(module 2\)"):
+        guard.frame(Judgement(safety.HIDDEN, detail="module 2"))
+
+
+@pytest.mark.parametrize("word", safety.GONE)
+def test_a_tracker_that_is_gone_is_lost_not_tripped(word):
+    guard = Guard(ROBOT)
+    guard.frame(Judgement(word))
+    guard.frame(Judgement(word))
+    with pytest.raises(LostInRun, match=word):
+        guard.frame(Judgement(word))
+
+
+def test_more_than_two_missed_ticks_end_the_run():
+    guard = Guard(ROBOT)
+    guard.missed(2)
+    guard.on_time()
+    guard.missed(1)
+    guard.missed(1)
+    with pytest.raises(Tripped, match="3 control ticks"):
+        guard.missed(1)
+    with pytest.raises(Tripped, match="8 control ticks"):
+        Guard(ROBOT).missed(8)
+
+
+# ---- what a model may answer, and how a robot may hang
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3.1, -40.0])
+def test_an_answer_that_means_nothing_is_refused(value):
+    with pytest.raises(ModelError, match="nothing of it was sent"):
+        check_actuation(np.array([[0.1], [value], [0.0]]))
+
+
+def test_an_answer_a_little_out_of_range_is_left_to_the_limits():
+    check_actuation(np.array([[1.2], [-1.2], [0.0]]))
+
+
+def test_rest():
+    check_rest(np.array([[0.0, 0.0, 1.0]] * 3))
+    with pytest.raises(Tripped, match="module 2 stands at 90 degrees"):
+        check_rest(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
