@@ -65,6 +65,8 @@ def library() -> ctypes.CDLL | None:
         [ctypes.c_int, pointer, ctypes.c_int, ctypes.c_int, ctypes.c_int, pointer, pointer, pointer, ctypes.c_long]
     )  # fmt: skip
     found.fleet_advance.restype = None
+    found.fleet_peak.argtypes = [ctypes.c_int, ctypes.c_long]
+    found.fleet_peak.restype = ctypes.c_double
     return found
 
 

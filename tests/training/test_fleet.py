@@ -148,7 +148,7 @@ def test_wrong_shapes_and_periods_are_refused():
     robots = Fleet("cable", 2, 3)
     with pytest.raises(ValueError, match=r"expected \(3, 2, 2\)"):
         robots.step(np.zeros((3, 4, 2)))
-    with pytest.raises(ValueError, match="found an actuation of 1.5"):
+    with pytest.raises(ValueError, match=r"found an actuation of 1\.5"):
         robots.step(np.full((3, 2, 2), 1.5))
     with pytest.raises(ValueError, match="found an actuation of nan"):
         robots.step(np.full((3, 2, 2), np.nan))

@@ -1,0 +1,257 @@
+"""What a time step of a simulated robot costs: the fleet against PyElastica, one robot and eight in a memory block.
+
+`python tools/bench/simulation.py`; `--compare` shows instead how far the two are apart.
+
+Everything is measured in one run, in short turns that follow each other, so that what else the machine does meets all
+alike; a figure is the least processor time of its turns, and only one core against two is by the wall clock. The share
+of the core's peak counts the arithmetic in fleet_kernel.h by hand (a multiply-add is two operations, a division or a
+root one), against multiply-adds that wait for nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import click
+import elastica
+import numpy as np
+
+from modsoft.runtime.errors import DeviceAbsent, ModsoftError
+from modsoft.training import kernel
+from modsoft.training.arm import Arm, _Loads, _Simulator
+from modsoft.training.fleet import Fleet
+from modsoft.training.robots import PLANTS
+
+OPERATIONS_PER_ELEMENT = {"cable": 454, "pneumatic": 480}
+ACTIONS = {"cable": 2, "pneumatic": 1}
+BLOCK = 8
+PEAK_ROUNDS = 2_000_000
+TURN_STEPS = 100
+
+
+class Block:
+    """Eight robots as rods of one PyElastica memory block, made of the rods and loads of as many `Arm`s."""
+
+    def __init__(self, kind: str, modules: int, actuation: np.ndarray) -> None:
+        self.plant = PLANTS[kind]
+        self.simulator = _Simulator()
+        for each in actuation:
+            arm = Arm(kind, modules)
+            arm.step(each, self.plant.time_step_s)  # sets the stresses
+            self.simulator.append(arm._rod)
+            ends = {"constrained_position_idx": (0,), "constrained_director_idx": (0,)}
+            self.simulator.constrain(arm._rod).using(elastica.OneEndFixedBC, **ends)
+            self.simulator.add_forcing_to(arm._rod).using(_Loads, self.plant, arm._state)
+        self.simulator.finalize()
+        self.stepper = elastica.PositionVerlet()
+        self.time_s = np.float64(0.0)
+
+    def advance(self) -> None:
+        for _ in range(TURN_STEPS):
+            self.time_s = self.stepper.step(self.simulator, self.time_s, self.plant.time_step_s)
+
+
+def turns(kind: str, modules: int, counts: list[int]) -> dict[str, tuple[int, Callable[[], object]]]:
+    """What is timed for one kind and module number: name to (robots, a turn of TURN_STEPS time steps)."""
+    turn_s = TURN_STEPS * PLANTS[kind].time_step_s
+    drawn = 0.5 * np.random.default_rng(modules).uniform(-1, 1, (max(*counts, BLOCK), modules, ACTIONS[kind]))
+    arm = Arm(kind, modules)
+    found: dict[str, tuple[int, Callable[[], object]]] = {
+        "elastica": (1, lambda: arm.step(drawn[0], turn_s)),
+        "elastica block of 8": (BLOCK, Block(kind, modules, drawn[:BLOCK]).advance),
+    }
+    for count in counts:
+        robots = Fleet(kind, modules, count)
+        found[f"fleet of {count}"] = (count, lambda robots=robots, count=count: robots.step(drawn[:count], turn_s))
+    return found
+
+
+def least_seconds(calls: dict[Any, Callable[[], object]], rounds: int, clock: Callable[[], float]) -> dict[Any, float]:
+    """Seconds of the quickest of `rounds` calls of each, called in turn; one more before, which is not counted."""
+    least = dict.fromkeys(calls, float("inf"))
+    for round_ in range(rounds + 1):
+        for name, call in calls.items():
+            start = clock()
+            call()
+            if round_:
+                least[name] = min(least[name], clock() - start)
+    return least
+
+
+def two_cores(rounds: int) -> dict[str, float]:
+    """Robot-steps a second by the wall clock: four-module robots on one thread and on two."""
+    drawn = 0.5 * np.random.default_rng(0).uniform(-1, 1, (32, 4, 2))
+    fleets = {threads: Fleet("cable", 4, 32, threads=threads) for threads in (1, 2)}
+    calls = {threads: lambda robots=robots: robots.step(drawn, 0.1) for threads, robots in fleets.items()}
+    seconds = least_seconds(calls, rounds, time.perf_counter)
+    per_second = {f"threads_{threads}": 32 * 400 / seconds[threads] for threads in fleets}
+    return {**per_second, "ratio": seconds[1] / seconds[2]}
+
+
+def measured(kinds: list[str], module_numbers: list[int], counts: list[int], rounds: int) -> dict[str, Any]:
+    library, variant = kernel.library(), len(kernel.VARIANTS) - 1
+    while not library.fleet_lanes(variant):
+        variant -= 1
+    parts = {}
+    for kind in kinds:
+        for modules in module_numbers:
+            try:
+                part = turns(kind, modules, counts)
+                for _ in range(rounds + 2):
+                    part["elastica"][1]()
+            except ModsoftError:  # a robot that PyElastica loses at once is not worth a figure
+                click.echo(f"a {kind} robot of {modules} modules does not hold: left out")
+            else:
+                parts[kind, modules] = part
+    calls: dict[Any, Callable[[], object]] = {
+        (*key, name): turn for key, part in parts.items() for name, (_, turn) in part.items()
+    }
+    calls["peak"] = lambda: library.fleet_peak(variant, PEAK_ROUNDS)
+    seconds = least_seconds(calls, rounds, time.process_time)
+    peak = 2 * 12 * library.fleet_lanes(variant) * PEAK_ROUNDS / seconds.pop("peak")
+    rows = []
+    for (kind, modules), part in parts.items():
+        us = {name: 1e6 * seconds[kind, modules, name] / TURN_STEPS / count for name, (count, _) in part.items()}
+        operations = OPERATIONS_PER_ELEMENT[kind] * modules * PLANTS[kind].elements
+        for count in counts:
+            cost = us[f"fleet of {count}"]
+            rows.append(
+                {
+                    "kind": kind,
+                    "modules": modules,
+                    "robots": count,
+                    "fleet_us": cost,
+                    "elastica_us": us["elastica"],
+                    "elastica_block_us": us["elastica block of 8"],
+                    "ratio": us["elastica"] / cost,
+                    "ratio_block": us["elastica block of 8"] / cost,
+                    "share_of_peak": operations / (1e-6 * cost) / peak,
+                }
+            )
+    return {
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "load_average": os.getloadavg()[0],
+        "pyelastica": version("pyelastica"),
+        "variant": kernel.VARIANTS[variant],
+        "peak_gflop_s": 1e-9 * peak,
+        "rows": rows,
+        "two_cores": two_cores(rounds),
+    }
+
+
+def processor() -> str:
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    families = [line.split(":", 1)[1].strip() for line in lines if line.startswith("cpu family")]
+    return f"{names[0]}, family {families[0]}" if names and families else platform.processor() or platform.machine()
+
+
+def table(result: dict[str, Any]) -> str:
+    cores = result["two_cores"]
+    lines = [
+        f"{result['processor']}, kernel {result['variant']}, peak {result['peak_gflop_s']:.0f} GFLOP/s a core, "
+        f"load {result['load_average']:.1f}; microseconds of processor time for a time step of one robot",
+        "",
+        "| kind | modules | robots | fleet | PyElastica | its block of 8 | ratio | ratio to block | share of peak |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for row in result["rows"]:
+        lines.append(
+            f"| {row['kind']} | {row['modules']} | {row['robots']} | {row['fleet_us']:.3f} | {row['elastica_us']:.1f} "
+            f"| {row['elastica_block_us']:.1f} | {row['ratio']:.1f} | {row['ratio_block']:.1f} "
+            f"| {100 * row['share_of_peak']:.0f} % |"
+        )
+    lines += [
+        "",
+        f"32 four-module cable robots by the wall clock: {cores['threads_1'] / 1e6:.2f} million robot-steps a second "
+        f"on one thread, {cores['threads_2'] / 1e6:.2f} on two: {cores['ratio']:.2f} times.",
+    ]
+    return "\n".join(lines)
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
+    """Cost over the number of modules, a panel for each kind."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    kinds = list(dict.fromkeys(row["kind"] for row in result["rows"]))
+    figure, axes = plt.subplots(1, len(kinds), figsize=(5.2 * len(kinds), 4.2), squeeze=False, layout="constrained")
+    for axis, kind in zip(axes[0], kinds, strict=True):
+        rows = [row for row in result["rows"] if row["kind"] == kind]
+        modules = sorted({row["modules"] for row in rows})
+        counts = sorted({row["robots"] for row in rows})
+        first = [row for row in rows if row["robots"] == counts[0]]
+        axis.plot(modules, [row["elastica_us"] for row in first], "k-o", label="PyElastica")
+        axis.plot(modules, [row["elastica_block_us"] for row in first], "k--s", label="PyElastica, block of 8")
+        for count in counts:
+            costs = [row["fleet_us"] for row in rows if row["robots"] == count]
+            axis.plot(modules, costs, "-o", label=f"fleet of {count}")
+        axis.set(title=kind, xlabel="modules", ylabel="microseconds a robot and time step", yscale="log")
+        axis.set_xticks(modules)
+        axis.grid(visible=True, which="both", alpha=0.3)
+        axis.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def compared(kinds: list[str], module_numbers: list[int], periods: int) -> list[dict[str, Any]]:
+    """Largest difference of a configuration between fleet and PyElastica under full-range random actions, both with
+    explicit damping. Where PyElastica loses the robot, the fleet has to lose it in the same period."""
+    rows = []
+    for kind in kinds:
+        for modules in module_numbers:
+            drawn = np.random.default_rng(2).uniform(-1, 1, (periods, 1, modules, ACTIONS[kind]))
+            arm, robots = Arm(kind, modules), Fleet(kind, modules, 1, damping="explicit")
+            apart, done = np.abs(robots.configuration[0] - arm.configuration).max(), 0
+            for action in drawn:
+                robots.step(action)
+                try:
+                    arm.step(action[0])
+                except ModsoftError:
+                    break
+                done += 1
+                apart = max(apart, np.abs(robots.configuration[0] - arm.configuration).max())
+            lost = "both" if done < periods and not robots.alive[0] else "elastica" if done < periods else ""
+            rows.append({"kind": kind, "modules": modules, "periods": done, "difference": float(apart), "lost": lost})
+            click.echo(f"{kind} {modules}: {apart:.1e} after {done} periods{' (lost by ' + lost + ')' if lost else ''}")
+    return rows
+
+
+@click.command(help=__doc__)
+@click.option("--kind", "kinds", multiple=True, type=click.Choice(list(PLANTS)), help="Default: all.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all figures here, one JSON object.")
+@click.option("--picture", type=click.Path(path_type=Path), help="Write a picture here (PNG).")
+@click.option("--quick", is_flag=True, help="Fewer sizes and turns: less than a minute.")
+@click.option("--compare", is_flag=True, help="How far fleet and PyElastica are apart after 50 periods; minutes.")
+def main(kinds: tuple[str, ...], json_file: Path | None, picture: Path | None, quick: bool, compare: bool) -> None:
+    if kernel.library() is None:
+        click.echo("the fleet's kernel is not built; expected a C compiler at installation: make install", err=True)
+        sys.exit(DeviceAbsent.exit_code)
+    chosen = list(kinds or PLANTS)
+    if compare:
+        rows = compared(chosen, [2, 4] if quick else [2, 3, 4, 6, 12], 5 if quick else 50)
+        result: dict[str, Any] = {"compared": rows}
+    else:
+        sizes = ([2, 4, 12], [1, 8, 64], 5) if quick else ([2, 3, 4, 6, 8, 12], [1, 2, 4, 8, 16, 32, 64], 15)
+        result = measured(chosen, *sizes)
+        click.echo(table(result))
+        if picture:
+            draw(result, picture)
+    if json_file:
+        json_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
