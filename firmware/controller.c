@@ -24,7 +24,6 @@ static void send(struct controller *c, uint8_t type, const void *payload, uint8_
 
 static void send_hello(struct controller *c) {
   struct hello hello;
-  memset(&hello, 0, sizeof hello);
   hello.protocol_hash = PROTOCOL_HASH;
   hello.firmware_version = FIRMWARE_VERSION;
   hello.boot_id = c->boot_id;

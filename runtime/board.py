@@ -72,6 +72,7 @@ class Board:
         self._dtr = True
         self._away = False  # closed for the time of a reset
         self._p_max = 0
+        self._listened = False
         self._changed = threading.Condition()  # guards the link
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -218,7 +219,8 @@ class Board:
                 self._link.vent(mode)
         if self._link.phase is Phase.READY:
             self._wait(lambda: self._said_vented(since), self._clock() + timeout_s)
-        if self._link.phase is Phase.LOST:
+        if self._link.phase is Phase.LOST and not self._listened:
+            self._listened = True  # once: nothing more will come after that
             self._wait(lambda: self._said_vented(since), self._clock() + LOST_VENT_WAIT_S)
         return self._said_vented(since)
 

@@ -395,6 +395,9 @@ def test_mute_board_is_lost(rig):
     assert port.now_ms - muted_at <= 460
     assert board.vent() is False  # it did vent, but it could not say so
     assert not any(port.board.counts)
+    listened_until = port.now_ms
+    assert board.close() is False
+    assert port.now_ms == listened_until  # nobody waits twice
 
 
 def test_board_reset_in_mid_run(rig):

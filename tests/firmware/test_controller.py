@@ -412,6 +412,16 @@ def test_nothing_that_a_host_says_while_idle_opens_a_valve(board):
         assert board.counts == [0] * 12
 
 
+def test_queue_for_the_host_fills_to_the_brim_and_no_further(board):
+    """A full ring would look like an empty one: 256 bytes must not be queued."""
+    board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH)) * 3)
+    board.feed((b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0") * 8)
+    raw = board.drain()
+    kinds = [type(frame.message) for frame in protocol.Parser().feed(raw)]
+    assert kinds == [Hello] * 4 + [protocol.Nack] * 7
+    assert len(raw) + len(raw) - raw.rindex(b"\0\0") - 1 == 256  # one more refusal would have met the brim exactly
+
+
 def test_board_never_waits_for_a_host_that_does_not_read(board):
     board.start(800)
     for _ in range(100):

@@ -1,0 +1,79 @@
+"""The firmware as a whole: it builds for the MEGA, its logic has no hardware in it, wrong limits do not compile."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
+VARIANT = Path("/usr/share/arduino/hardware/arduino/avr/variants/mega/pins_arduino.h")
+
+
+def test_builds_for_the_mega_and_is_small():
+    if shutil.which("avr-gcc") is None or not VARIANT.exists():
+        pytest.skip("needs Debian packages gcc-avr avr-libc arduino-core-avr")
+    done = subprocess.run(["make", "-C", str(FIRMWARE)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "warning" not in done.stderr
+    elf = FIRMWARE.parent / "build" / "firmware" / "modsoft.elf"
+    size = subprocess.run(["avr-size", str(elf)], capture_output=True, text=True, check=True).stdout.split()
+    text, data, bss = (int(word) for word in size[6:9])
+    assert text + data < 16_000
+    assert data + bss < 2_000  # of 8 KiB; the rest is for the stack
+
+
+@pytest.mark.parametrize("name", ["frame.c", "output.c", "controller.c"])
+def test_logic_includes_no_hardware(name):
+    includes = re.findall(r"#include\s+([<\"].*?[>\"])", (FIRMWARE / name).read_text())
+    allowed = {"<stdint.h>", "<string.h>", '"protocol.h"', '"frame.h"', '"output.h"', '"controller.h"'}
+    assert set(includes) <= allowed | {'"limits.h"', '"pins.h"'}
+
+
+@pytest.mark.parametrize(
+    ("changed", "complaint"),
+    [
+        (("#define P_MIN 800", "#define P_MIN 3500"), "limits out of order"),
+        (("#define SLEW 20000U", "#define SLEW 10000U"), "SLEW is too slow to vent in time"),
+        (("#define SENSOR_FULL 10000L", "#define SENSOR_FULL 4000L"), "cannot see an over-pressure"),
+        (("#define LINK_TIMEOUT_MS 300", "#define LINK_TIMEOUT_MS 150"), "one late heartbeat"),
+    ],
+)
+def test_impossible_limits_do_not_compile(tmp_path, changed, complaint):
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc here")
+    text = (FIRMWARE / "limits.h").read_text()
+    assert changed[0] in text
+    (tmp_path / "limits.h").write_text(text.replace(*changed))
+    (tmp_path / "limits.c").write_text('#include "limits.h"\n')
+    done = subprocess.run(
+        ["gcc", f"-I{FIRMWARE}", "-fsyntax-only", str(tmp_path / "limits.c")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert complaint in done.stderr
+
+
+def test_channels_have_the_pins_of_the_arduino_core():
+    """pins.h names port and bit; the core's own table of the MEGA must give the same for each pin number."""
+    if not VARIANT.exists():
+        pytest.skip("needs Debian package arduino-core-avr")
+    rows = re.findall(r"X\((\d+), (\d+), (\d), ([ABC]), ([A-L]), (\d)\)", (FIRMWARE / "pins.h").read_text())
+    assert [int(row[0]) for row in rows] == list(range(12))
+    assert int(rows[-1][1]) == 13, "the bootloader's lamp comes last"
+    ports = {
+        int(pin): (port, int(bit))
+        for port, bit, pin in re.findall(r"// P([A-L]) (\d) \*\* (\d+) \*\*", VARIANT.read_text())
+    }
+    timers = dict(re.findall(r"TIMER(\d[ABC])\s*,\s*// P[A-L] \d \*\* (\d+) \*\*", VARIANT.read_text()))
+    timer_of = {int(pin): timer for timer, pin in timers.items()}
+    assert timer_of[13] == "0A"  # the core uses pin 13's other timer; the chip has timer 1, unit C there as well
+    timer_of[13] = "1C"
+    for _, pin, timer, unit, port, bit in rows:
+        assert ports[int(pin)] == (port, int(bit)), f"pin {pin}"
+        assert timer_of[int(pin)] == timer + unit, f"pin {pin}"
