@@ -13,12 +13,12 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from modsoft.runtime.configuration import feature_names
+from modsoft.runtime.configuration import feature_names, labels
 from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training.dataset import DataSet, Windows, split
@@ -42,20 +42,19 @@ class Settings:
     dropout: float = 0.05  # between layers
     layers: int = 4  # Table S1
     hidden: int = 128  # Table S1
+    shorter: float = 0.0  # share of the steps that take the robot's last modules for a robot of their own
     split: str = "blocks"
     seed: int = 0
     threads: int = 1
 
 
-@dataclass(frozen=True)
-class Progress:
-    """What a run tells as it goes on."""
+class Progress(NamedTuple):
+    """What a run tells after every step of the optimiser."""
 
     iteration: int
-    share: float  # of the run, 0 to 1
-    loss: float
+    share: float  # of the run that is over, 0 to 1
+    loss: float  # of this step
     validation_percent: float  # of the best weights so far
-    samples_per_s: float
 
 
 def one_cycle(share: float, peak: float) -> float:
@@ -86,67 +85,14 @@ def train(
     torch.set_num_threads(settings.threads)
     torch.manual_seed(settings.seed)
     training, validation, test = split(data, settings.history, settings.split, settings.seed)
-    features, targets = torch.from_numpy(training.features), torch.from_numpy(training.targets)
-    network = BiLSTM(features.shape[-1], targets.shape[-1], settings.layers, settings.hidden, settings.dropout)
-    optimiser = torch.optim.Adam(network.parameters(), lr=settings.rate)
+    features, actions = training.features.shape[-1], training.targets.shape[-1]
+    network = BiLSTM(features, actions, settings.layers, settings.hidden, settings.dropout)
     identity = {"data_sha256": data.sha256(), **asdict(settings)}
-    state = {"identity": identity, "iteration": 0, "elapsed_s": 0.0, "best": None, "best_percent": math.inf, "worse": 0}
     resume = out.with_name(f"{out.name}.resume")
-    if resume.is_file():
-        state = _resumed(resume, identity)
-        network.load_state_dict(state["weights"])
-        optimiser.load_state_dict(state["optimiser"])
-        torch.set_rng_state(state["random_state"])
-
-    per_epoch = -(-len(training) // settings.batch)
-    iteration = first = state["iteration"]
-    began_s = clock() - state["elapsed_s"]
-    checked, checked_s, loss_sum = iteration, clock(), 0.0
-    order = np.zeros(0)
-    share = _share(iteration, clock() - began_s, settings)
-    next_check = _checks_due(share) + 1
-    while share < 1.0 and state["worse"] < PATIENCE:
-        epoch, step = divmod(iteration, per_epoch)
-        if step == 0 or iteration == first:
-            order = np.random.default_rng([settings.seed, epoch]).permutation(len(training))
-        rows = torch.from_numpy(order[step * settings.batch : (step + 1) * settings.batch])
-        network.train()
-        for group in optimiser.param_groups:
-            group["lr"] = one_cycle(share, settings.rate)
-        loss = torch.nn.functional.mse_loss(network(features[rows]), targets[rows])
-        optimiser.zero_grad()
-        loss.backward()
-        # The first steps at a high rate now and then meet a gradient a hundred times the usual one.
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
-        iteration += 1
-        loss_sum += loss.item()
-        share = _share(iteration, clock() - began_s, settings)
-
-        if _checks_due(share) >= next_check:
-            next_check = _checks_due(share) + 1
-            percent = float(estimation_errors(network, validation).mean())
-            if percent < state["best_percent"]:
-                weights = {name: value.clone() for name, value in network.state_dict().items()}
-                state.update(best=weights, best_percent=percent, worse=0)
-            else:
-                state["worse"] += 1
-            now_s = clock()
-            done = iteration - checked
-            rate = done * settings.batch / max(now_s - checked_s, 1e-9)
-            progress(Progress(iteration, share, loss_sum / done, state["best_percent"], rate))
-            checked, checked_s, loss_sum = iteration, now_s, 0.0
-            state.update(
-                iteration=iteration,
-                elapsed_s=now_s - began_s,
-                weights=network.state_dict(),
-                optimiser=optimiser.state_dict(),
-                random_state=torch.get_rng_state(),
-            )
-            checkpoints.save(state, resume)
-
+    state = _fit(network, training, validation, settings, identity, resume, progress, clock)
     if state["best"] is None:
         raise ModelError(f"{out}: training diverged, no weights have a finite validation error; try a smaller --rate")
+
     network.load_state_dict(state["best"])
     errors = estimation_errors(network, test)
     checkpoint = {
@@ -154,8 +100,8 @@ def train(
         "robot": data.recipe["robot"],
         "network": {
             "name": "bilstm",
-            "feature_size": features.shape[-1],
-            "action_size": targets.shape[-1],
+            "feature_size": features,
+            "action_size": actions,
             "layers": settings.layers,
             "hidden": settings.hidden,
             "dropout": settings.dropout,
@@ -171,8 +117,8 @@ def train(
             "strategy": data.recipe["strategy"],
             "samples": data.samples,
             "windows": [len(training), len(validation), len(test)],
-            "iterations_done": iteration,
-            "seconds": round(clock() - began_s, 1),
+            "iterations_done": state["iteration"],
+            "seconds": round(state["elapsed_s"], 1),
             "validation_percent": state["best_percent"],
             # Actuation estimation error of the test part, percent of the range, by module: the paper's Table 1.
             "errors_percent": [round(float(e), 4) for e in errors.mean(dim=(0, 2))],
@@ -182,6 +128,82 @@ def train(
     checkpoints.save(checkpoint, out)
     resume.unlink(missing_ok=True)
     return checkpoint
+
+
+def _fit(
+    network: BiLSTM,
+    training: Windows,
+    validation: Windows,
+    settings: Settings,
+    identity: dict[str, Any],
+    resume: Path,
+    progress: Callable[[Progress], None],
+    clock: Callable[[], float],
+) -> dict[str, Any]:
+    """The loop. Leaves the state of its end in the file `resume` and gives it: `best` weights, `best_percent`,
+    `iteration`, `elapsed_s` and what it takes to go on."""
+    features, targets = torch.from_numpy(training.features), torch.from_numpy(training.targets)
+    optimiser = torch.optim.Adam(network.parameters(), lr=settings.rate)
+    state = {"identity": identity, "iteration": 0, "elapsed_s": 0.0, "best": None, "best_percent": math.inf, "worse": 0}
+    if resume.is_file():
+        state = _resumed(resume, identity)
+        network.load_state_dict(state["weights"])
+        optimiser.load_state_dict(state["optimiser"])
+        torch.set_rng_state(state["random_state"])
+
+    per_epoch = -(-len(training) // settings.batch)
+    iteration = first = state["iteration"]
+    began_s = clock() - state["elapsed_s"]
+    order = np.zeros(0)
+    share = _share(iteration, clock() - began_s, settings)
+    while share < 1.0 and state["worse"] < PATIENCE:
+        epoch, step = divmod(iteration, per_epoch)
+        if step == 0 or iteration == first:
+            order = np.random.default_rng([settings.seed, epoch]).permutation(len(training))
+        rows = torch.from_numpy(order[step * settings.batch : (step + 1) * settings.batch])
+        modules = _modules_of_step(targets.shape[1], settings, iteration)
+        for group in optimiser.param_groups:
+            group["lr"] = one_cycle(share, settings.rate)
+        network.train()
+        loss = torch.nn.functional.mse_loss(network(last_modules(features[rows], modules)), targets[rows, -modules:])
+        optimiser.zero_grad()
+        loss.backward()
+        # The first steps at a high rate now and then meet a gradient a hundred times the usual one.
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+
+        iteration += 1
+        before, share = share, _share(iteration, clock() - began_s, settings)
+        progress(Progress(iteration, share, loss.item(), state["best_percent"]))
+        if _checks_due(share) > _checks_due(before):
+            percent = float(estimation_errors(network, validation).mean())
+            if percent < state["best_percent"]:
+                weights = {name: value.clone() for name, value in network.state_dict().items()}
+                state.update(best=weights, best_percent=percent, worse=0)
+            else:
+                state["worse"] += 1
+            state.update(
+                iteration=iteration,
+                elapsed_s=clock() - began_s,
+                weights=network.state_dict(),
+                optimiser=optimiser.state_dict(),
+                random_state=torch.get_rng_state(),
+            )
+            checkpoints.save(state, resume)
+    return state
+
+
+def last_modules(features: torch.Tensor, modules: int) -> torch.Tensor:
+    """The last `modules` of a robot's features (W, N, F), labelled as a robot of that many (eq. 1)."""
+    last = features[:, -modules:].clone()
+    last[..., -1] = torch.from_numpy(labels(modules))
+    return last
+
+
+def _modules_of_step(modules: int, settings: Settings, iteration: int) -> int:
+    """Modules that the robot of this step has: all, or in the share `shorter` of the steps from 2 to all but one."""
+    rng = np.random.default_rng([settings.seed, 1, iteration])
+    return int(rng.integers(2, modules)) if modules > 2 and rng.uniform() < settings.shorter else modules
 
 
 def _share(iteration: int, elapsed_s: float, settings: Settings) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,12 @@ from modsoft.runtime.errors import UsageError
 @click.option("--batch", default=64, type=click.IntRange(1), help="Windows in a step.")
 @click.option("--rate", default=3e-3, type=click.FloatRange(min=0, min_open=True), help="Peak learning rate.")
 @click.option("--dropout", default=0.05, type=click.FloatRange(0, 1, max_open=True), help="Between the layers.")
+@click.option(
+    "--shorter",
+    default=0.0,
+    type=click.FloatRange(0, 1),
+    help="Share of the steps that take the robot's last modules for a shorter robot.",
+)
 @click.option("--history", type=click.IntRange(1), help="Time steps T.  [default: 5 cable, 10 pneumatic]")
 @click.option(
     "--split",
@@ -49,15 +56,20 @@ def cli(data_file: Path, out: Path, history: int | None, **options: Any) -> None
 
     data = dataset.read(data_file)
     settings = train.Settings(history=history or train.HISTORY[data.robot.robot.kind], **options)
+    began_s, first, smooth = time.monotonic(), None, 0.0
     with tqdm(
-        total=100, unit="%", desc="train", bar_format="{desc}: {percentage:3.0f}% {bar} {postfix} {remaining} left"
+        total=100, desc="train", bar_format="{desc}: {percentage:3.0f}%|{bar}| {remaining} left, {postfix}"
     ) as bar:
 
         def progress(told: train.Progress) -> None:
+            nonlocal first, smooth
+            if first is None:  # what an earlier run did does not count into the rate
+                first, smooth = told.iteration - 1, told.loss
+            smooth = 0.98 * smooth + 0.02 * told.loss
+            rate = (told.iteration - first) * options["batch"] / (time.monotonic() - began_s)
+            best = f"{told.validation_percent:.2f} %"
+            bar.set_postfix_str(f"{rate:.0f} samples/s, loss {smooth:.5f}, best validation {best}", refresh=False)
             bar.update(100 * told.share - bar.n)
-            bar.set_postfix_str(
-                f"loss {told.loss:.5f}, validation {told.validation_percent:.2f} %, {told.samples_per_s:.0f} samples/s,"
-            )
 
         made = train.train(data, out, settings, progress)
     said = made["provenance"]

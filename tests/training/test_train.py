@@ -54,8 +54,9 @@ def test_it_learns_and_the_checkpoint_says_all(tmp_path):
     _, _, test = dataset.split(data, 3, "blocks", 0)
     again = train.estimation_errors(checkpoints.network_of(found), test)
     np.testing.assert_allclose(again.mean(dim=(0, 2)).numpy(), errors, atol=1e-3)
+    assert [t.iteration for t in told] == list(range(1, 601))
     assert told[-1].share == 1.0
-    assert told[-1].validation_percent == pytest.approx(found["provenance"]["validation_percent"])
+    assert np.mean([t.loss for t in told[-50:]]) < 0.05 * told[0].loss
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
@@ -71,24 +72,28 @@ class Cut(Exception):
     """Stands for a kill: nothing of the run is told that it comes."""
 
 
-@pytest.mark.parametrize("checks", [1, 7, 15])
-def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, checks):
-    straight = train.train(make(), tmp_path / "straight.pt", SMALL)
-    out = tmp_path / "cut.pt"
-    seen = []
-
+def cut_at(iteration: int):
     def cut(told):
-        seen.append(told)
-        if len(seen) > checks:  # before this check is saved: the work since the one before is lost
+        if told.iteration == iteration:
             raise Cut
 
+    return cut
+
+
+@pytest.mark.parametrize("iteration", [4, 21, 59])
+def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, iteration):
+    settings = dataclasses.replace(SMALL, shorter=0.3)
+    straight = train.train(make(), tmp_path / "straight.pt", settings)
+    out = tmp_path / "cut.pt"
     with pytest.raises(Cut):
-        train.train(make(), out, SMALL, cut)
+        train.train(make(), out, settings, cut_at(iteration))
     assert not out.exists()
     torch.manual_seed(123)  # a new process has another random state
     resumed = []
-    found = train.train(make(), out, SMALL, resumed.append)
-    assert resumed[0].iteration == checks * (SMALL.iterations // train.CHECKS) + SMALL.iterations // train.CHECKS
+    found = train.train(make(), out, settings, resumed.append)
+    # From the last check: the work since then was lost, and no more.
+    every = settings.iterations // train.CHECKS
+    assert resumed[0].iteration == (iteration - 1) // every * every + 1
     assert equal(found["weights"], straight["weights"])
     assert found["provenance"]["errors_percent"] == straight["provenance"]["errors_percent"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.pt", "straight.pt"]
@@ -96,13 +101,8 @@ def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, checks):
 
 def test_a_cut_run_of_other_settings_or_data_is_refused(tmp_path):
     out = tmp_path / "model.pt"
-
-    def cut(told):
-        if told.iteration > 6:
-            raise Cut
-
     with pytest.raises(Cut):
-        train.train(make(), out, SMALL, cut)
+        train.train(make(), out, SMALL, cut_at(7))
     with pytest.raises(ModelError, match=r"model.pt.resume: of a run with batch 32, asked for 64"):
         train.train(make(), out, dataclasses.replace(SMALL, batch=64))
     with pytest.raises(ModelError, match="of a run with data_sha256"):
@@ -120,13 +120,22 @@ def test_it_stops_early_and_keeps_the_best_weights(tmp_path):
     told = []
     settings = dataclasses.replace(SMALL, iterations=4000, rate=0.02, hidden=32, dropout=0.0)
     found = train.train(data, tmp_path / "model.pt", settings, told.append)
-    best = min(t.validation_percent for t in told)
-    assert found["provenance"]["iterations_done"] < 4000
-    since = [t.iteration for t in told if t.validation_percent > best or t is told[0]]
-    assert found["provenance"]["iterations_done"] - max(since) >= train.PATIENCE * 200
+    best = found["provenance"]["validation_percent"]
+    first_with_best = next(t.iteration for t in told if t.validation_percent == best)
+    every = settings.iterations // train.CHECKS
+    assert found["provenance"]["iterations_done"] == first_with_best - 1 + train.PATIENCE * every < 4000
     _, validation, _ = dataset.split(data, 3, "blocks", 0)
     again = float(train.estimation_errors(checkpoints.network_of(found), validation).mean())
     assert again == pytest.approx(best, abs=1e-4)
+
+
+def test_the_last_modules_are_labelled_as_a_robot_of_their_own():
+    training, _, _ = dataset.split(make(), 3, "blocks", 0)
+    features = torch.from_numpy(training.features)
+    two = train.last_modules(features, 2)
+    assert torch.equal(two[..., :-1], features[:, 1:, :-1])
+    assert two[0, :, -1].tolist() == [-1.0, 1.0]
+    assert torch.equal(train.last_modules(features, 3), features)
 
 
 def test_a_budget_of_minutes_ends_the_run_with_its_learning_rate_at_nothing(tmp_path):
