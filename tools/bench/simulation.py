@@ -28,13 +28,13 @@ from modsoft.runtime.errors import DeviceAbsent, ModsoftError
 from modsoft.training import kernel
 from modsoft.training.arm import Arm, _Loads, _Simulator
 from modsoft.training.fleet import Fleet
-from modsoft.training.robots import PLANTS
+from modsoft.training.robots import PLANTS, Plant
 
 OPERATIONS_PER_ELEMENT = {"cable": 454, "pneumatic": 480}
 ACTIONS = {"cable": 2, "pneumatic": 1}
 BLOCK = 8
 PEAK_ROUNDS = 2_000_000
-TURN_STEPS = 100
+TURNS_A_PERIOD = 4  # a turn is a quarter of a control period
 
 
 class Block:
@@ -55,13 +55,17 @@ class Block:
         self.time_s = np.float64(0.0)
 
     def advance(self) -> None:
-        for _ in range(TURN_STEPS):
+        for _ in range(turn_steps(self.plant)):
             self.time_s = self.stepper.step(self.simulator, self.time_s, self.plant.time_step_s)
 
 
+def turn_steps(plant: Plant) -> int:
+    return round(plant.period_s / plant.time_step_s) // TURNS_A_PERIOD
+
+
 def turns(kind: str, modules: int, counts: list[int]) -> dict[str, tuple[int, Callable[[], object]]]:
-    """What is timed for one kind and module number: name to (robots, a turn of TURN_STEPS time steps)."""
-    turn_s = TURN_STEPS * PLANTS[kind].time_step_s
+    """What is timed for one kind and module number: name to (robots, a turn)."""
+    turn_s = turn_steps(PLANTS[kind]) * PLANTS[kind].time_step_s
     drawn = 0.5 * np.random.default_rng(modules).uniform(-1, 1, (max(*counts, BLOCK), modules, ACTIONS[kind]))
     arm = Arm(kind, modules)
     found: dict[str, tuple[int, Callable[[], object]]] = {
@@ -90,9 +94,9 @@ def two_cores(rounds: int) -> dict[str, float]:
     """Robot-steps a second by the wall clock: four-module robots on one thread and on two."""
     drawn = 0.5 * np.random.default_rng(0).uniform(-1, 1, (32, 4, 2))
     fleets = {threads: Fleet("cable", 4, 32, threads=threads) for threads in (1, 2)}
-    calls = {threads: lambda robots=robots: robots.step(drawn, 0.1) for threads, robots in fleets.items()}
+    calls = {threads: lambda robots=robots: robots.step(drawn) for threads, robots in fleets.items()}
     seconds = least_seconds(calls, rounds, time.perf_counter)
-    per_second = {f"threads_{threads}": 32 * 400 / seconds[threads] for threads in fleets}
+    per_second = {f"threads_{threads}": 32 * 4000 / seconds[threads] for threads in fleets}
     return {**per_second, "ratio": seconds[1] / seconds[2]}
 
 
@@ -119,7 +123,8 @@ def measured(kinds: list[str], module_numbers: list[int], counts: list[int], rou
     peak = 2 * 12 * library.fleet_lanes(variant) * PEAK_ROUNDS / seconds.pop("peak")
     rows = []
     for (kind, modules), part in parts.items():
-        us = {name: 1e6 * seconds[kind, modules, name] / TURN_STEPS / count for name, (count, _) in part.items()}
+        steps = turn_steps(PLANTS[kind])
+        us = {name: 1e6 * seconds[kind, modules, name] / steps / count for name, (count, _) in part.items()}
         operations = OPERATIONS_PER_ELEMENT[kind] * modules * PLANTS[kind].elements
         for count in counts:
             cost = us[f"fleet of {count}"]
