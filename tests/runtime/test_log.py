@@ -1,0 +1,188 @@
+"""The run log: every line at once, nothing lost to a kill, and no harm from a full disk."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from modsoft.runtime import log as logs
+from modsoft.runtime.errors import ModelError, UsageError
+
+NOW = datetime(2025, 3, 4, 5, 6, 7, tzinfo=UTC)
+
+
+def a_log(folder: Path) -> logs.RunLog:
+    return logs.RunLog(folder, "arm", "[robot]\n", {"task": "down"}, NOW)
+
+
+def wait_for(condition) -> None:
+    """The writer's thread is another one: it is given its turn, not a time."""
+    for _ in range(5000):
+        if condition():
+            return
+        threading.Event().wait(0.001)
+    raise AssertionError("the log's thread never got there")
+
+
+def test_folder_and_files(tmp_path):
+    log = a_log(tmp_path / "runs")
+    assert log.folder == tmp_path / "runs" / "20250304T050607Z-arm"
+    assert (log.folder / "robot.toml").read_text() == "[robot]\n"
+    open_meta = json.loads((log.folder / "meta.json").read_text())
+    assert (open_meta["task"], open_meta["exit_code"], open_meta["started"]) == ("down", None, NOW.isoformat())
+    log.put({"tick": 0, "acknowledged": {"tick": -1, "ms": None}})
+    log.close(79, "stop key pressed", {"vented": True})
+    meta = json.loads((log.folder / "meta.json").read_text())
+    assert (meta["exit_code"], meta["reason"], meta["vented"], meta["lines_lost"]) == (79, "stop key pressed", True, 0)
+    assert meta["versions"]["python"].startswith("3.")
+    assert sorted(path.name for path in log.folder.iterdir()) == ["meta.json", "robot.toml", "run.jsonl"]
+
+
+def test_two_runs_in_one_second(tmp_path):
+    first, second = a_log(tmp_path), a_log(tmp_path)
+    assert second.folder.name == first.folder.name + "-2"
+    first.close(0, "done", {})
+    second.close(0, "done", {})
+
+
+def test_no_place_to_log_is_a_usage_error(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="--runs-dir"):
+        a_log(tmp_path / "file")
+
+
+def test_a_line_is_in_the_file_before_the_log_is_closed(tmp_path):
+    log = a_log(tmp_path)
+    path = log.folder / "run.jsonl"
+    for tick in range(3):
+        log.put({"tick": tick, "value": np.float64(0.5)})
+        wait_for(lambda tick=tick: path.read_bytes().count(b"\n") == tick + 1)
+    assert [json.loads(line) for line in path.read_text().splitlines()][2] == {"tick": 2, "value": 0.5}
+    log.close(0, "done", {})
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(VALUES)
+def test_every_value_becomes_strict_json(value):
+    text = json.dumps(logs.plain(value), allow_nan=False)
+    assert "\n" not in text
+    json.loads(text)
+
+
+def test_arrays_and_nan_become_lists_and_null():
+    value = {"a": np.array([[1.0, np.nan]]), "b": np.int64(3), "c": (np.inf, np.True_), "d": 1 / 3}
+    assert logs.plain(value) == {"a": [[1.0, None]], "b": 3, "c": [None, True], "d": 0.333333333}
+
+
+class Disk:
+    """`os.write` of a disk with so much room, which gives it back when asked."""
+
+    def __init__(self, room: int):
+        self.room = room
+
+    def write(self, file: int, data: bytes) -> int:
+        if self.room == 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written = os.write(file, data[: self.room])
+        self.room -= written
+        return written
+
+
+def test_full_disk_loses_lines_but_raises_nothing_and_recovers(tmp_path):
+    disk = Disk(25)
+    writer = logs.Writer(tmp_path / "run.jsonl", disk.write)
+    for tick in range(3):  # 11 bytes each: the third is torn
+        writer.put({"tick": tick})
+    wait_for(lambda: writer.lost == 1)
+    writer.put({"tick": 3})
+    wait_for(lambda: writer.lost == 2)
+    assert writer.error == os.strerror(errno.ENOSPC)
+    disk.room = 1000
+    writer.put({"tick": 4})
+    writer.close()
+    assert (tmp_path / "run.jsonl").read_bytes() == b'{"tick":0}\n{"tick":1}\n{"t\n{"tick":4}\n'
+
+
+def test_a_disk_that_hangs_does_not_hold_the_loop(tmp_path):
+    freed = threading.Event()
+
+    def hang(file: int, data: bytes) -> int:
+        freed.wait(30)
+        return len(data)
+
+    writer = logs.Writer(tmp_path / "run.jsonl", hang)
+    for tick in range(logs.QUEUE_LINES + 50):
+        writer.put({"tick": tick})
+    assert writer.lost >= 48
+    freed.set()
+    writer.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_a_real_full_device(tmp_path):
+    (tmp_path / "run.jsonl").symlink_to("/dev/full")
+    writer = logs.Writer(tmp_path / "run.jsonl")
+    writer.put({"tick": 0})
+    writer.close()
+    assert (writer.lost, writer.error) == (1, os.strerror(errno.ENOSPC))
+
+
+WRITES_FOR_EVER = """
+import sys
+from pathlib import Path
+from modsoft.runtime.log import RunLog
+log = RunLog(Path(sys.argv[1]), "arm", "", {})
+for tick in range(100):
+    log.put({"tick": tick})
+print("put", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_killed_process_has_lost_nothing(tmp_path):
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITES_FOR_EVER, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout.readline() == b"put\n"
+        [path] = tmp_path.glob("*/run.jsonl")
+        wait_for(lambda: path.read_bytes().endswith(b'{"tick":99}\n'))
+        process.send_signal(signal.SIGKILL)
+    assert [json.loads(line)["tick"] for line in path.read_text().splitlines()] == list(range(100))
+    assert json.loads((path.parent / "meta.json").read_text())["exit_code"] is None
+
+
+def test_reading_gives_each_tick_its_own_acknowledgement(tmp_path):
+    log = a_log(tmp_path)
+    log.put({"event": "start"})
+    log.put({"tick": 0, "acknowledged": {"tick": -1, "ms": 5.0}})
+    log.put({"tick": 1, "acknowledged": {"tick": 0, "ms": 7.0}})
+    log.put({"tick": 2, "acknowledged": {"tick": 1, "ms": None}})
+    log.close(0, "done", {})
+    with (log.folder / "run.jsonl").open("a") as torn:
+        torn.write('{"tick": 3, "ack')
+    run = logs.read(log.folder)
+    assert [line["tick"] for line in run.ticks] == [0, 1, 2]
+    assert [line["acknowledged"]["ms"] for line in run.ticks] == [7.0, None, None]
+    assert [line["event"] for line in run.events] == ["start"]
+    assert run.meta["exit_code"] == 0
+
+
+def test_reading_what_is_no_run(tmp_path):
+    with pytest.raises(ModelError, match="no folder of a run"):
+        logs.read(tmp_path)

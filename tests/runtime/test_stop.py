@@ -1,0 +1,148 @@
+"""Signals and stop keys become one request; a second Ctrl-C leaves at once."""
+
+import io
+import os
+import signal
+import threading
+
+import pytest
+
+from modsoft.runtime.display import StatusLine
+from modsoft.runtime.errors import Tripped
+from modsoft.runtime.stop import SIGNALS, Interrupted, Keys, Signals, Stop, StopKey
+
+NUMBERS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
+
+
+def test_the_first_request_wins():
+    stop = Stop()
+    stop.check()
+    stop.request(StopKey("first"))
+    stop.request(Tripped("second"))
+    stop.wait(3600)  # returns at once
+    with pytest.raises(StopKey, match="first") as caught:
+        stop.check()
+    assert caught.value.exit_code == 79
+
+
+@pytest.mark.parametrize(("number", "code"), NUMBERS.items())
+def test_exit_codes_of_signals(number, code):
+    assert number in SIGNALS
+    assert Interrupted(number).exit_code == code
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_before_the_run_a_signal_raises_where_the_program_is(number):
+    def interrupted():
+        with Signals(Stop()):
+            os.kill(os.getpid(), number)
+            threading.Event().wait(5)
+
+    before = signal.getsignal(number)
+    with pytest.raises(Interrupted):
+        interrupted()
+    assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_in_the_run_a_signal_only_asks(number):
+    stop, left = Stop(), []
+    with Signals(stop, left.append) as signals:
+        signals.hold()
+        os.kill(os.getpid(), number)
+        stop.wait(5)
+        with pytest.raises(Interrupted):
+            stop.check()
+        os.kill(os.getpid(), number)
+        # A closing terminal sends SIGHUP twice; a person who presses Ctrl-C again wants out.
+        assert left == ([] if number == signal.SIGHUP else [NUMBERS[number]])
+
+
+def test_keys_do_nothing_without_a_terminal(monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO("q"))
+    stop = Stop()
+    with Keys(stop):
+        stop.wait(0)
+    assert stop.error is None
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """A pseudo-terminal as standard input, ours to read from."""
+    master, slave = os.openpty()
+    with open(slave, closefd=False) as stream:
+        monkeypatch.setattr("sys.stdin", stream)
+        monkeypatch.setattr("os.tcgetpgrp", lambda file: os.getpgrp())
+        yield master, slave
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.mark.parametrize("key", [b" ", b"q", b"\x1b", b"xyq"])
+def test_stop_keys(terminal, key):
+    import termios
+
+    master, slave = terminal
+    before = termios.tcgetattr(slave)
+    stop = Stop()
+    with Keys(stop):
+        os.write(master, key)
+        stop.wait(10)
+        assert isinstance(stop.error, StopKey)
+    assert termios.tcgetattr(slave) == before
+
+
+def test_other_keys_are_no_stop(terminal):
+    master, _ = terminal
+    stop = Stop()
+    with Keys(stop):
+        os.write(master, b"xyz\n")
+        stop.wait(0.2)
+    assert stop.error is None
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_status_line_is_written_over(monkeypatch):
+    shown, stream, written = ["one"], Terminal(), threading.Event()
+    real = stream.write
+    monkeypatch.setattr(stream, "write", lambda text: real(text) and written.set())
+    with StatusLine(lambda: shown[0], stream):
+        assert written.wait(10)
+    assert stream.getvalue() == "\r\x1b[Kone\n"
+
+
+def test_no_status_line_without_a_terminal():
+    stream = io.StringIO()
+    with StatusLine(lambda: "one", stream):
+        pass
+    assert stream.getvalue() == ""
+
+
+def test_a_halted_terminal_does_not_halt_the_run():
+    class Halted(Terminal):
+        def write(self, text):
+            threading.Event().wait(30)
+            return len(text)
+
+    shown = threading.Event()
+
+    def text():
+        shown.set()
+        return "one"
+
+    with StatusLine(text, Halted()):
+        assert shown.wait(10)
+
+
+def test_a_terminal_that_is_gone_is_no_error():
+    class Gone(Terminal):
+        def write(self, text):
+            raise OSError("gone")
+
+    with StatusLine(lambda: "one", Gone()) as line:
+        line._thread.join(10)
+        assert not line._thread.is_alive()
