@@ -52,13 +52,14 @@ STAGES = [
         "collect data from the simulated three-module robot",
         ["modsoft-collect", "--robot", ROBOT, "--samples", "15000", "--strategy", "staged", "--out", str(DATA)],
         DATA,
-        [f"runtime/robots/{ROBOT}.toml", *(f"training/{name}" for name in ("robots.py", "arm.py", "collect.py"))],
+        [f"runtime/robots/{ROBOT}.toml", "training/fleet*.[ch]"]
+        + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "collect")],
     ),
     Stage(
         "train the biLSTM controller",
         ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--minutes", "2.5"],
         CHECKPOINT,
-        [str(DATA), *(f"training/{name}" for name in ("train.py", "dataset.py", "networks.py"))],
+        [str(DATA)] + [f"training/{name}.py" for name in ("train", "dataset", "networks")],
     ),
     Stage(
         "export it and compare it with torch",

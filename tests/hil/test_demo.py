@@ -1,0 +1,110 @@
+"""`make demo`: what is made again and what is not, and the short report."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def demo(tmp_path, monkeypatch):
+    """tools/demo.py, in an empty folder, with commands that are recorded and end as told."""
+    spec = importlib.util.spec_from_file_location("demo", ROOT / "tools" / "demo.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(__import__("sys").modules, "demo", module)  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    monkeypatch.chdir(tmp_path)
+    module.FOLDER.mkdir()
+    module.ran = []
+
+    def run(command):
+        module.ran.append(command[0])
+        Path(command[-1]).write_text(f"made by {command}")
+        return module.exit_code
+
+    module.exit_code = 0
+    monkeypatch.setattr(module, "run", run)
+    return module
+
+
+def stage(demo, *options):
+    return demo.Stage("make it", ["tool", *options, "demo/result"], demo.FOLDER / "result", ["input.*"])
+
+
+def test_a_stage_is_made_once(demo):
+    assert demo.make(stage(demo), "[1/1]") == 0
+    assert demo.make(stage(demo), "[1/1]") == 0
+    assert demo.ran == ["tool"]
+
+
+@pytest.mark.parametrize("change", ["input", "command", "result lost"])
+def test_a_stage_is_made_again_when_something_changed(demo, change):
+    Path("input.txt").write_text("1")
+    demo.make(stage(demo), "[1/1]")
+    options = []
+    match change:
+        case "input":
+            Path("input.txt").write_text("2")
+        case "command":
+            options = ["--more"]
+        case "result lost":
+            (demo.FOLDER / "result").unlink()
+    demo.make(stage(demo, *options), "[1/1]")
+    assert demo.ran == ["tool", "tool"]
+
+
+def test_an_interrupted_stage_goes_on_with_what_it_left(demo):
+    demo.make(stage(demo), "[1/1]")
+    (demo.FOLDER / "result").unlink()
+    parts = demo.FOLDER / "result.parts"
+    parts.mkdir()
+    demo.make(stage(demo), "[1/1]")
+    assert parts.is_dir()
+
+
+def test_leftovers_of_another_order_are_cleared_away(demo):
+    demo.make(stage(demo), "[1/1]")
+    parts = demo.FOLDER / "result.parts"
+    parts.mkdir()
+    (demo.FOLDER / "result.resume").write_text("half a training")
+    demo.make(stage(demo, "--more"), "[1/1]")
+    assert not parts.exists()
+    assert not (demo.FOLDER / "result.resume").exists()
+
+
+def test_a_failed_stage_is_made_again(demo):
+    demo.exit_code = 65
+    assert demo.make(stage(demo), "[1/1]") == 65
+    demo.exit_code = 0
+    (demo.FOLDER / "result").unlink()
+    assert demo.make(stage(demo), "[1/1]") == 0
+    assert demo.ran == ["tool", "tool"]
+
+
+def test_the_stages_hang_together(demo):
+    """What a stage makes is what the next one depends on, and the files of the project that they name exist."""
+    for before, after in zip(demo.STAGES, demo.STAGES[1:], strict=False):
+        assert str(before.makes) in after.depends_on
+        assert str(before.makes) in after.command
+    assert str(demo.STAGES[-1].makes) in demo.RUN
+    for pattern in [pattern for each in demo.STAGES for pattern in each.depends_on]:
+        assert pattern.startswith("demo/") or list(ROOT.glob(pattern)), pattern
+
+
+def test_the_short_report_says_what_is_asked(demo):
+    spread = {"p50": 0.2, "p99": 1.5, "max": 2.0}
+    figures = {
+        "ticks": 200,
+        "missed_ticks": 0,
+        "held_ticks": 1,
+        "lateness_ms": spread,
+        "acknowledged_ms": None,
+        "tracking_error_deg": {"mean": [0.5, 1.25], "std": [0.1, 0.2]},
+    }
+    report = {"figures": figures, "about": {"board": "a board"}, "verdict": "failed", "reason": "held ticks 1"}
+    text = "\n".join(demo.summary(report))
+    assert "module 2  1.25° ± 0.20°" in text
+    assert "median 0.2, 99 % 1.5, largest 2.0 ms" in text
+    assert "failed: held ticks 1" in text
