@@ -18,7 +18,7 @@ install:
 	tools/install.sh
 	@touch $(INSTALLED)
 
-$(INSTALLED): pyproject.toml constraints.txt tools/install.sh
+$(INSTALLED): pyproject.toml setup.py constraints.txt tools/install.sh training/fleet.c training/fleet_kernel.h
 	tools/install.sh
 	@touch $@
 
