@@ -130,6 +130,11 @@ class Loop:
         self.valves.check()
         if self.slot.error is not None:
             raise LostInRun(f"tracker lost: {self.slot.error}; check its cable and start again")
+        # A frame just after a tick is young enough for the next one, so counting bad ticks alone could take a period
+        # longer than the robot file allows.
+        frame, silence_s = self.slot.latest(), self.robot.limits.invalid_frames * self.robot.loop.period_s
+        if frame is not None and self.ticker.now() - frame.monotonic_s > silence_s:
+            raise LostInRun(f"tracker: no new frame for {silence_s:.1f} s; look at the tracker, then start again")
 
     def _acknowledged(self, step: int, sequence: int) -> dict[str, Any]:
         """Whether the board has the set-points of `step`, and how long it took to say so."""

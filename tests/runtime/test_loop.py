@@ -1,0 +1,418 @@
+"""The loop on virtual time: a tracker, a model and a board that do what the test tells them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.actuation import channel_pressures_bar
+from modsoft.runtime.clock import Ticker
+from modsoft.runtime.configuration import Window, bending_angle_deg, from_angles_deg, state_of
+from modsoft.runtime.errors import LostInRun, ModelError, Tripped
+from modsoft.runtime.log import plain
+from modsoft.runtime.loop import Loop
+from modsoft.runtime.protocol import CHANNELS, State
+from modsoft.runtime.rehearsal import Rehearsal
+from modsoft.runtime.safety import FrameJudge
+from modsoft.runtime.stop import Interrupted, Stop, StopKey
+from modsoft.runtime.tally import Tally
+from modsoft.runtime.tracker import Frame, Slot
+
+ROBOT = robots.load("pneumatic-3")
+PERIOD_S = ROBOT.loop.period_s
+REST = np.array([[0.0, 0.0, 1.0]] * 3)
+
+
+class World:
+    """Virtual time with a robot that is at `angles(step)`, a tracker of 60 Hz, a board and a model.
+
+    `at[step]` is called when that step's turn has come, before the loop looks at anything.
+    """
+
+    def __init__(self, steps=10, robot=ROBOT):
+        self.robot = robot
+        self.time_s = 500.0
+        self.frame_age_s = 0.02
+        self.hidden = ()
+        self.slot = Slot()
+        self.slot.put(self.frame())
+        self.lines = []
+        self.stop = Stop()
+        self.at = {}
+        self.tracked = True
+        self.sent = []  # (time, wire tick, pressures)
+        self.beats = []
+        self.features = []
+        self.answer = lambda features: np.full((robot.modules, 1), 0.1)
+        self.work_s = 0.001
+        self.acknowledging = True
+        self.lost = None
+        # the board
+        self.status = SimpleNamespace(acked_seq=0, state=State.ARMED, faults=0, tick=0)
+        self.status_age_s = 0.05
+        self.ack_latency_s = None
+        self.applied_bar = np.zeros(CHANNELS)
+        self.measured_bar = np.full(CHANNELS, np.nan)
+        self.statistics = {"sets": 0}
+        # the model
+        self.history = 3
+        desired = from_angles_deg(np.outer(np.arange(steps), [1.0, 2.0, -3.0][: robot.modules]))
+        self.tally = Tally(robot, steps)
+        self.loop = Loop(
+            robot, self, desired, self.slot, FrameJudge(robot), self,
+            Ticker(PERIOD_S, lambda: self.time_s, self.wait), self.stop, self.lines.append, self.tally,
+        )  # fmt: skip
+
+    def frame(self, angles=(0.0, 0.0, 0.0), **changes):
+        at_s = self.time_s - self.frame_age_s
+        count = self.robot.modules + 1
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        for tool, total in enumerate(np.radians(np.cumsum(angles[: count - 1])), 1):
+            poses[tool, :3, :3] = [[np.cos(total), 0, np.sin(total)], [0, 1, 0], [-np.sin(total), 0, np.cos(total)]]
+        valid = np.ones(count, bool)
+        valid[list(self.hidden)] = False
+        parts = {"poses": poses, "valid": valid, "quality": np.full(count, 0.1)}
+        return Frame(int(at_s * 60), at_s, **(parts | changes))
+
+    def hide(self, *tools):
+        """These are not seen from now on."""
+        self.hidden = tools
+
+    def due_s(self, step):
+        return 500.0 + (step + 1) * PERIOD_S
+
+    def wait(self, seconds):
+        self.time_s += seconds
+        for step in [step for step in self.at if self.time_s >= self.due_s(step) - 1e-6]:
+            self.at.pop(step)()
+        if self.tracked:
+            self.slot.put(self.frame())
+
+    # the board
+
+    def check(self):
+        if self.lost:
+            raise self.lost
+
+    def set_pressures(self, tick, pressures_bar):
+        self.check()
+        sequence = (len(self.sent) + 1) & 0xFF
+        self.sent.append((self.time_s, tick, np.array(pressures_bar)))
+        self.status.state, self.status.tick = State.RUNNING, tick
+        if self.acknowledging:
+            self.status.acked_seq, self.ack_latency_s = sequence, 0.007
+        return sequence
+
+    def beat(self, tick):
+        self.beats.append(tick)
+
+    # the model
+
+    def actuate(self, features):
+        self.features.append(features)
+        self.time_s += self.work_s
+        return self.answer(features)
+
+    # the test
+
+    def run(self):
+        self.loop.run(REST[: self.robot.modules])
+        return self
+
+    @property
+    def ticks(self):
+        return [line for line in self.lines if "tick" in line]
+
+
+def test_a_whole_task():
+    world = World(steps=10).run()
+    assert [line["tick"] for line in world.ticks] == list(range(10))
+    assert [tick for _, tick, _ in world.sent] == list(range(11))  # actuation 0 first, then every step
+    times = np.array([at_s for at_s, *_ in world.sent])
+    np.testing.assert_allclose(np.diff(times), [PERIOD_S + 0.001] + [PERIOD_S] * 9, atol=1e-6)
+    zero = channel_pressures_bar(ROBOT, np.zeros((3, 1)), CHANNELS)
+    assert np.array_equal(world.sent[0][2], zero)
+    for line, (_, _, pressures) in zip(world.ticks, world.sent[1:], strict=True):
+        assert np.array_equal(line["commanded_bar"], pressures)
+        assert (line["sent"], line["verdict"], line["missed"]) == (True, "good", 0)
+    # it returns one period after the last step, so that the last command has had its time
+    assert world.time_s == pytest.approx(500.0 + 11 * PERIOD_S)
+    assert [line["event"] for line in world.lines if "event" in line] == ["start", "done"]
+
+
+def test_every_line_can_be_written_and_says_what_the_task_wanted():
+    world = World(steps=5).run()
+    for step, line in enumerate(world.ticks):
+        written = plain(line)
+        assert next(iter(written)) == "tick"
+        np.testing.assert_allclose(bending_angle_deg(line["desired"]), step * np.array([1.0, 2.0, -3.0]))
+        assert written["board"]["measured_bar"] == [None] * CHANNELS
+        assert written["board"]["state"] == "RUNNING"
+        assert written["frame"]["age_ms"] == pytest.approx(20.0)
+        assert written["late_ms"] < 1e-3
+
+
+def test_the_model_gets_the_window_that_training_makes():
+    world = World(steps=6)
+    answers = iter(np.linspace(0.05, 0.3, 6))
+    world.answer = lambda features: np.full((3, 1), next(answers))
+    world.run()
+    window = Window(3, state_of(REST, "pneumatic"), 1)
+    for k, given_features in enumerate(world.features):
+        window.observe(state_of(world.ticks[k]["configuration"], "pneumatic"))
+        np.testing.assert_allclose(
+            given_features, window.features(state_of(world.loop.desired[k], "pneumatic")), atol=1e-12
+        )
+        window.applied(world.ticks[k]["actuation"])
+
+
+def test_the_actuation_is_held_to_the_robot_files_step():
+    world = World(steps=6)
+    world.answer = lambda features: np.array([[2.0], [-2.0], [0.2]])
+    world.run()
+    actuation = np.array([line["actuation"] for line in world.ticks])[:, :, 0]
+    np.testing.assert_allclose(actuation[:, 0], [0.4, 0.8, 1.0, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(actuation[:, 1], -actuation[:, 0])
+    assert np.array_equal(world.ticks[0]["raw"], [[2.0], [-2.0], [0.2]])
+
+
+def test_a_bad_frame_holds_the_command_and_the_state():
+    world = World(steps=8)
+    world.tracked = False
+
+    def see(**changes):
+        return lambda: world.slot.put(world.frame(**changes))
+
+    hidden = np.array([True, False, True, True])
+    for step in range(8):
+        world.at[step] = see(valid=hidden) if step in (3, 4) else see(angles=(0.0, step * 1.0, 0.0))
+    answers = iter([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    world.answer = lambda features: np.full((3, 1), next(answers))
+    world.run()
+    assert [line["verdict"] for line in world.ticks[2:6]] == ["good", "tool hidden", "tool hidden", "good"]
+    for step in (3, 4):
+        line = world.ticks[step]
+        assert line["raw"] is None
+        assert line["configuration"] is None
+        assert np.array_equal(line["actuation"], world.ticks[2]["actuation"])
+        assert np.array_equal(world.sent[step + 1][2], world.sent[3][2])  # sent again, which feeds the board's timer
+    # the window of step 5: states of steps 3 (held: step 2), 4 (held), then 5 as slots; T - 1 = 2 measured ones
+    states = world.features[3].reshape(3, -1)
+    held, now = np.sin(np.radians(2.0)), np.sin(np.radians(5.0))
+    assert states[1, 0] == pytest.approx(held)
+    assert states[1, 3] == pytest.approx(now)
+    assert world.tally.bad == {"tool hidden": 2}
+
+
+@pytest.mark.parametrize("phase_s", np.arange(0.0, PERIOD_S, 0.05))
+def test_a_tracker_that_falls_silent_ends_the_run_in_time_whatever_the_phase(phase_s):
+    world = World(steps=20)
+
+    def fall_silent():
+        if world.time_s >= world.due_s(5) + phase_s - 1e-6:
+            world.tracked = False
+
+    frame = world.frame
+    world.frame = lambda **changes: fall_silent() or frame(**changes)
+    with pytest.raises(LostInRun, match="no new frame"):
+        world.run()
+    assert world.time_s - world.slot.latest().monotonic_s <= 1.2 + 0.05
+
+
+@pytest.mark.parametrize("phase_s", np.arange(0.0, PERIOD_S, 0.05))
+def test_a_hidden_tool_ends_the_run_at_the_third_tick(phase_s):
+    world = World(steps=20)
+
+    def hide():
+        if world.time_s >= world.due_s(5) + phase_s - 1e-6:
+            world.hide(2)
+
+    frame = world.frame
+    world.frame = lambda **changes: hide() or frame(**changes)
+    with pytest.raises(Tripped, match=r"3 ticks in a row.*tool hidden"):
+        world.run()
+    first_bad = next(line["tick"] for line in world.ticks if line["verdict"] != "good")
+    assert world.time_s == pytest.approx(world.due_s(first_bad + 2))
+
+
+def test_nothing_older_than_a_period_is_ever_used():
+    world = World(steps=30)
+
+    def late(age_s):
+        def change():
+            world.frame_age_s = age_s
+
+        return change
+
+    world.at = {step: late(age) for step, age in [(4, 0.39), (8, 0.45), (9, 0.02), (14, 2.0), (15, 0.02)]}
+    world.run()
+    used = [line["frame"]["age_ms"] for line in world.ticks if line["verdict"] == "good"]
+    assert max(used) <= 400.0
+    assert len(used) < 30
+
+
+def test_a_lost_tracker_ends_the_run_at_once():
+    world = World(steps=20)
+    world.at[5] = lambda: setattr(world.slot, "error", OSError("read error"))
+    with pytest.raises(LostInRun, match="read error"):
+        world.run()
+    assert world.time_s == pytest.approx(world.due_s(5))
+
+
+@pytest.mark.parametrize("error", [LostInRun("the board is gone"), Tripped("OVER_PRESSURE")])
+def test_a_board_in_trouble_ends_the_run_between_two_ticks(error):
+    world = World(steps=20)
+    world.at[5] = lambda: setattr(world, "lost", error)
+    with pytest.raises(type(error), match=str(error)):
+        world.run()
+    assert world.time_s == pytest.approx(world.due_s(5))
+
+
+@pytest.mark.parametrize("error", [StopKey("stop key pressed"), Interrupted(2)])
+def test_whoever_wants_to_stop_is_obeyed_between_two_ticks(error):
+    world = World(steps=20)
+    world.at[5] = lambda: world.stop.request(error)
+    with pytest.raises(type(error)):
+        world.run()
+    assert world.time_s == pytest.approx(world.due_s(5))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -50.0])
+def test_what_the_model_must_not_answer_is_not_sent(value):
+    world = World(steps=20)
+    world.answer = lambda features: np.full((3, 1), value if len(world.features) == 7 else 0.1)
+    with pytest.raises(ModelError):
+        world.run()
+    assert len(world.sent) == 7  # actuation 0, and six steps
+    assert all(np.isfinite(pressures).all() for *_, pressures in world.sent)
+
+
+def test_a_step_that_takes_too_long_is_not_sent_and_the_next_is_in_time():
+    world = World(steps=10)
+
+    def slow(features):
+        if len(world.features) == 4:
+            world.time_s += 0.25
+        return np.full((3, 1), 0.1 + 0.01 * len(world.features))
+
+    world.answer = slow
+    world.run()
+    assert [line["sent"] for line in world.ticks] == [True] * 3 + [False] + [True] * 6
+    assert world.ticks[3]["commanded_bar"] is None
+    assert np.array_equal(world.ticks[3]["actuation"], world.ticks[2]["actuation"])  # what the valves really hold
+    assert world.beats == [4]
+    assert world.tally.missed == 1
+    assert 3 not in [tick - 1 for _, tick, _ in world.sent]
+
+
+def test_skipped_ticks_go_into_the_history_as_held():
+    world = World(steps=12)
+    world.answer = lambda features: np.full((3, 1), 0.05 * len(world.features))
+    world.at[4] = lambda: setattr(world, "time_s", world.time_s + 2.3 * PERIOD_S)
+    world.run()
+    missed = [line["missed"] for line in world.ticks]
+    assert sum(missed) == 2
+    after = missed.index(2)
+    assert world.ticks[after]["tick"] == world.ticks[after - 1]["tick"] + 3  # the task goes on in real time
+    actions = world.features[after].reshape(3, -1)[0, [2, 5, 8]]
+    np.testing.assert_allclose(actions, [0.05 * after] * 3)
+
+
+def test_a_long_stall_ends_the_run():
+    world = World(steps=20)
+    world.at[4] = lambda: setattr(world, "time_s", world.time_s + 5 * PERIOD_S)
+    with pytest.raises(Tripped, match="missed"):
+        world.run()
+
+
+def test_acknowledgements_belong_to_the_step_before():
+    world = World(steps=6)
+    world.at[2] = lambda: setattr(world, "acknowledging", False)
+    world.at[4] = lambda: setattr(world, "acknowledging", True)
+    world.run()
+    told = [line["acknowledged"] for line in world.lines if "acknowledged" in line]
+    assert [entry["tick"] for entry in told] == [-1, 0, 1, 2, 3, 4, 5]
+    assert [entry["ms"] for entry in told][1:] == pytest.approx(world.tally.acknowledged_ms)
+    assert sum(ms is None for ms in world.tally.acknowledged_ms) == 2
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(0, 1.2), min_size=1, max_size=12), st.lists(st.floats(0, 0.9), min_size=1, max_size=12))
+def test_set_points_are_never_less_than_half_a_period_apart(stalls, works):
+    world = World(steps=15)
+    world.at = {step: lambda s=s: setattr(world, "time_s", world.time_s + s) for step, s in enumerate(stalls)}
+
+    def work(features):
+        world.time_s += works[len(world.features) % len(works)]
+        world.slot.put(world.frame())
+        return np.full((3, 1), 0.1)
+
+    world.answer = work
+    try:
+        world.run()
+    except (Tripped, LostInRun):
+        pass  # more than two missed in a row, or frames too old
+    times = [at_s for at_s, *_ in world.sent]
+    assert np.all(np.diff(times) >= PERIOD_S / 2 - 1e-9)
+    ticks = [tick for _, tick, _ in world.sent]
+    assert ticks == sorted(set(ticks))
+
+
+def test_two_modules_run_with_the_same_loop():
+    world = World(steps=5, robot=robots.load("pneumatic-2"))
+    world.run()
+    assert world.features[0].shape == (2, 3 * 3 + 1)
+    assert len(world.ticks) == 5
+
+
+def test_a_rehearsal_runs_the_task_without_a_board():
+    world = World(steps=5)
+    loop = world.loop
+    Loop(
+        loop.robot, loop.model, loop.desired, loop.slot, loop.judge, Rehearsal(), loop.ticker, loop.stop, loop.log,
+        loop.tally,
+    ).run(REST)  # fmt: skip
+    assert world.sent == []
+    assert len(world.ticks) == 5
+    assert world.ticks[0]["board"] is None
+
+
+# ---- what is told of it
+
+
+def test_summary_and_figures():
+    world = World(steps=10)
+    world.at[3] = lambda: world.hide(1)
+    world.at[4] = lambda: world.hide()
+    world.run()
+    figures = world.tally.figures()
+    assert (figures["steps"], figures["missed"], figures["unacknowledged"]) == (10, 0, 0)
+    assert sum(figures["held"].values()) == sum(line["verdict"] != "good" for line in world.ticks) > 0
+    good = [line["tick"] for line in world.ticks if line["verdict"] == "good"]
+    np.testing.assert_allclose(figures["error_deg_mean"], np.mean(good) * np.array([1.0, 2.0, 3.0]))
+    assert figures["acknowledged_ms"] == pytest.approx({"p50": 7.0, "p99": 7.0, "max": 7.0})
+    text = "\n".join(world.tally.summary())
+    assert "10 of 10 control steps" in text
+    assert f"module 3: error {3 * np.mean(good):.2f}" in text
+    assert "missed ticks: 0" in text
+
+
+def test_summary_of_a_run_that_never_began():
+    tally = Tally(ROBOT, 10)
+    assert tally.figures()["late_ms"] is None
+    assert tally.summary()[0] == "0 of 10 control steps"
+
+
+def test_status_line():
+    world = World(steps=5)
+    world.measured_bar = np.full(CHANNELS, np.nan)
+    world.measured_bar[:6] = 0.081
+    world.run()
+    status = world.tally.status
+    assert status.startswith(
+        "step 5/5  2.50 Hz  late 0 missed 0  tracker 20 ms 4/4  a +0.10 +0.10 +0.10  bar 0.11|0.08"
+    )
+    assert status.endswith("ack 7.0 ms")
