@@ -1,0 +1,173 @@
+"""modsoft-runtime from the outside: every mistake in one clear line with its own exit code; nothing heavy loaded."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from modsoft.runtime import robot as robots
+
+SCRIPT = Path(sys.executable).with_name("modsoft-runtime")
+
+
+def run(*arguments, cwd=None):
+    return subprocess.run(
+        [SCRIPT, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, stdin=subprocess.DEVNULL, timeout=60
+    )
+
+
+def refused(code, *arguments, cwd=None):
+    """The one line that the command ends with."""
+    done = run(*arguments, cwd=cwd)
+    assert done.returncode == code, done.stderr
+    assert done.stdout == ""
+    [line] = done.stderr.splitlines()
+    assert line.startswith("modsoft-runtime: ")
+    return line
+
+
+@pytest.fixture
+def port(tmp_path):
+    """A file stands in for a port that exists; nothing may open it before everything else is right."""
+    path = tmp_path / "ttyACM0"
+    path.touch()
+    return path
+
+
+@pytest.fixture
+def tools(tmp_path):
+    found = []
+    for tool in range(4):
+        path = tmp_path / f"{tool}.rom"
+        path.write_bytes(b"NDI")
+        found += ["--tool", path]
+    return found
+
+
+def test_help_has_what_a_newcomer_needs():
+    done = run("--help")
+    assert done.returncode == 0
+    for word in ("First steps", "--print-robot", "--port", "--dry-run", "Exit codes", "robot.toml", "model.onnx"):
+        assert word in done.stdout
+    assert run("-h").stdout == done.stdout
+
+
+def test_nothing_heavy_is_imported():
+    code = (
+        "import sys\n"
+        "import modsoft.runtime.cli\n"
+        "print([n for n in ('torch', 'onnx', 'elastica', 'numba', 'numpy', 'onnxruntime', 'serial') "
+        "if n in sys.modules])\n"
+        "import modsoft.runtime.session\n"
+        "print([n for n in ('torch', 'onnx', 'elastica', 'numba', 'h5py', 'sksurgerynditracker') if n in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[:2] == ["[]", "[]"]
+
+
+def test_print_robot_is_a_robot_file(tmp_path):
+    done = run("--print-robot", "pneumatic-3")
+    (tmp_path / "robot.toml").write_text(done.stdout)
+    assert robots.load(tmp_path / "robot.toml") == robots.load("pneumatic-3")
+    assert "cable-4" in refused(64, "--print-robot", "octopus")
+
+
+def test_check_robot(tmp_path):
+    done = run("--check", "pneumatic-2")
+    assert done.returncode == 0
+    assert "2 modules, 2.5 Hz" in done.stdout
+    assert "full scale 3 bar" in done.stdout
+    (tmp_path / "robot.toml").write_text(robots.text_of("pneumatic-3").replace("modules = 3", "modules = 4"))
+    assert "chambers" in refused(64, "--check", tmp_path / "robot.toml")
+
+
+def test_list_ports():
+    assert run("--list-ports").returncode == 0
+
+
+def test_version():
+    assert run("--version").stdout.startswith("modsoft-runtime, version ")
+
+
+def test_no_robot_file_here(tmp_path):
+    line = refused(64, "--port", "/dev/null", cwd=tmp_path)
+    assert "no robot.toml in this folder" in line
+    assert "--robot" in line
+
+
+def test_a_wrong_robot_file(tmp_path, port):
+    path = tmp_path / "robot.toml"
+    path.write_text(robots.text_of("pneumatic-3").replace("full_scale_bar = 3.0", "full_scale = 3.0"))
+    assert "full_scale" in refused(64, "--port", port, cwd=tmp_path)
+
+
+def test_a_simulated_robot_is_refused(port):
+    assert "only simulated" in refused(64, "--port", port, "--robot", "cable-4")
+
+
+def test_no_port_told():
+    assert "--port" in refused(2, "--robot", "pneumatic-3")
+
+
+def test_the_port_does_not_exist(tmp_path, model_file):
+    line = refused(69, "--robot", "pneumatic-3", "--model", model_file, "--port", tmp_path / "ttyACM7")
+    assert "no board at" in line
+    assert "ttyACM7" in line
+
+
+def test_no_model_here(tmp_path, port):
+    line = refused(65, "--robot", "pneumatic-3", "--port", port, cwd=tmp_path)
+    assert "model.onnx" in line
+    assert "--model" in line
+
+
+def test_a_damaged_model(tmp_path, port, model_file):
+    data = bytearray(model_file.read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "bad.onnx").write_bytes(data)
+    line = refused(65, "--robot", "pneumatic-3", "--port", port, "--model", tmp_path / "bad.onnx")
+    assert "bad.onnx" in line
+    assert port.read_bytes() == b""
+
+
+def test_no_task(tmp_path, port, model_file):
+    (tmp_path / "robot.toml").write_text(robots.text_of("pneumatic-3").replace('task = "down"', 'task = ""'))
+    assert "--task" in refused(2, "--port", port, "--model", model_file, cwd=tmp_path)
+    assert "edge, down" in refused(2, "--port", port, "--model", model_file, "--task", "up", cwd=tmp_path)
+
+
+def test_no_tracker_told(port, model_file):
+    assert "--tracker-port" in refused(2, "--robot", "pneumatic-3", "--port", port, "--model", model_file)
+
+
+def test_the_tracker_does_not_exist(tmp_path, port, model_file, tools):
+    told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, *tools]
+    line = refused(69, *told, "--tracker-port", tmp_path / "ttyUSB7")
+    assert "no tracker at" in line
+    line = refused(69, *told, "--tracker-port", "/dev/null")
+    assert "no polaris tracker answers" in line
+    assert port.read_bytes() == b""
+
+
+def test_no_tools_told(port, model_file):
+    told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
+    line = refused(2, *told)
+    assert "--tool" in line
+
+
+def test_tools_of_a_robot_file_lie_beside_it(tmp_path, port, model_file):
+    (tmp_path / "arm").mkdir()
+    names = '["base.rom", "1.rom", "2.rom", "3.rom"]'
+    text = robots.text_of("pneumatic-3").replace("tools = []", f"tools = {names}")
+    (tmp_path / "arm" / "robot.toml").write_text(text)
+    told = ["--robot", "arm/robot.toml", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
+    assert os.path.join("arm", "base.rom") in refused(69, *told, cwd=tmp_path)
+
+
+@pytest.mark.parametrize("wrong", [["--steps", "0"], ["--tracker", "sonar"], ["--prot", "x"]])
+def test_usage(wrong):
+    done = run("--robot", "pneumatic-3", *wrong)
+    assert done.returncode == 2
+    assert wrong[0] in done.stderr

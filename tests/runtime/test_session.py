@@ -1,0 +1,117 @@
+"""How a run ends: venting first, the log closed, and what is said and raised."""
+
+import json
+
+import pytest
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime import session
+from modsoft.runtime.errors import LostInRun, ModelError, Tripped, UsageError
+from modsoft.runtime.log import RunLog
+from modsoft.runtime.protocol import VentMode
+from modsoft.runtime.safety import FrameJudge
+from modsoft.runtime.stop import Interrupted, Stop, StopKey
+from modsoft.runtime.tally import Tally
+from modsoft.runtime.tracker import Slot
+
+ROBOT = robots.load("pneumatic-3")
+
+
+class Board:
+    """Answers a request to vent with `word`, or raises it."""
+
+    def __init__(self, word):
+        self.word, self.modes, self.statistics = word, [], {"sets": 3}
+
+    def vent(self, mode):
+        self.modes.append(mode)
+        if isinstance(self.word, Exception):
+            raise self.word
+        return self.word
+
+
+class Ending:
+    """What `finish` did."""
+
+    def __init__(self, tmp_path, capsys, board, error=None):
+        log = RunLog(tmp_path, "arm", "", {})
+        self.raised = None
+        try:
+            session.finish(board, log, Tally(ROBOT, 10), Slot(), error)
+        except BaseException as raised:  # noqa: BLE001 - looked at by the test
+            self.raised = raised
+        self.said = capsys.readouterr().err
+        self.meta = json.loads((log.folder / "meta.json").read_text())
+        self.end = json.loads((log.folder / "run.jsonl").read_text().splitlines()[-1])
+
+
+def test_done(tmp_path, capsys):
+    board = Board(True)
+    ending = Ending(tmp_path, capsys, board)
+    assert ending.raised is None
+    assert board.modes == [VentMode.RAMP]
+    assert "valves vented: yes, said by the board" in ending.said
+    assert (ending.meta["exit_code"], ending.meta["reason"], ending.meta["vented"]) == (0, "done", True)
+    assert (ending.end["event"], ending.end["exit_code"], ending.end["vented"]) == ("end", 0, True)
+
+
+@pytest.mark.parametrize("word", [False, OSError("port gone")])
+def test_a_board_that_does_not_say_so_is_not_vented(tmp_path, capsys, word):
+    ending = Ending(tmp_path, capsys, Board(word))
+    assert isinstance(ending.raised, LostInRun | OSError)
+    assert "yes, said" not in ending.said
+    assert "NOT KNOWN" in ending.said
+    assert ending.meta["exit_code"] in (74, 70)
+    assert ending.meta["vented"] is False
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(Interrupted(2), 130), (Interrupted(15), 143), (Interrupted(1), 129), (ModelError("nan"), 65),
+     (Tripped("limit"), 79), (LostInRun("tracker"), 74), (ValueError("a bug"), 70), (KeyboardInterrupt(), 70)],
+)  # fmt: skip
+@pytest.mark.parametrize("word", [True, False])
+def test_what_ended_the_run_is_raised_after_the_venting(tmp_path, capsys, error, code, word):
+    board = Board(word)
+    ending = Ending(tmp_path, capsys, board, error)
+    assert ending.raised is error
+    assert board.modes == [VentMode.RAMP]
+    assert ending.meta["exit_code"] == code
+    assert ending.meta["reason"]
+    assert ("yes, said" in ending.said) == word
+
+
+def test_the_stop_key_vents_at_once(tmp_path, capsys):
+    board = Board(True)
+    assert isinstance(Ending(tmp_path, capsys, board, StopKey("stop key pressed")).raised, StopKey)
+    assert board.modes == [VentMode.DUMP]
+
+
+def test_a_dry_run_says_so(tmp_path, capsys):
+    ending = Ending(tmp_path, capsys, None)
+    assert "no valve was touched" in ending.said
+    assert "yes" not in ending.said
+    assert ending.meta["vented"] is False
+
+
+def test_arming_needs_somebody(monkeypatch):
+    import io
+
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    with pytest.raises(UsageError, match="--yes"):
+        session._ask()
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
+    session._ask()
+
+
+def test_no_frame_is_waited_for_only_so_long(monkeypatch):
+    clock = [0.0]
+    stop = Stop()
+    monkeypatch.setattr(stop, "wait", lambda seconds: clock.__setitem__(0, clock[0] + seconds))
+    with pytest.raises(session.DeviceAbsent, match="no good frame within 5 s, the last one no frame"):
+        session._rest(Slot(), FrameJudge(ROBOT), stop, lambda: clock[0])
+    assert clock[0] == pytest.approx(5.0, abs=0.02)
+    slot = Slot()
+    slot.error = OSError("unplugged")
+    with pytest.raises(session.DeviceAbsent, match="unplugged"):
+        session._rest(slot, FrameJudge(ROBOT), stop, lambda: clock[0])
