@@ -37,8 +37,12 @@ def cli(robot_file: str, out: Path, samples: int, strategy: str, seed: int, step
     robot = robots.load(robot_file)
     from tqdm import tqdm
 
+    from modsoft.training import plants
     from modsoft.training.collect import collect
 
+    plant = plants.fastest(robot)
+    if plant.name == "elastica":
+        click.echo("the fast plant is not built (no C compiler at installation?): PyElastica, slower", err=True)
     bar: tqdm | None = None
 
     def progress(done: int, total: int) -> None:
@@ -48,7 +52,7 @@ def cli(robot_file: str, out: Path, samples: int, strategy: str, seed: int, step
         bar.update(done - bar.n)
 
     try:
-        data = collect(robot, out, samples, strategy, seed, steps, jobs, progress=progress)
+        data = collect(robot, out, samples, strategy, seed, steps, jobs, plant, progress)
     finally:
         if bar is not None:
             bar.close()

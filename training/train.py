@@ -144,7 +144,8 @@ def _fit(
     `iteration`, `elapsed_s` and what it takes to go on."""
     features, targets = torch.from_numpy(training.features), torch.from_numpy(training.targets)
     optimiser = torch.optim.Adam(network.parameters(), lr=settings.rate)
-    state = {"identity": identity, "iteration": 0, "elapsed_s": 0.0, "best": None, "best_percent": math.inf, "worse": 0}
+    state: dict[str, Any] = {"identity": identity, "iteration": 0, "elapsed_s": 0.0}
+    state |= {"best": None, "best_percent": math.inf, "worse": 0}
     if resume.is_file():
         state = _resumed(resume, identity)
         network.load_state_dict(state["weights"])
@@ -154,7 +155,7 @@ def _fit(
     per_epoch = -(-len(training) // settings.batch)
     iteration = first = state["iteration"]
     began_s = clock() - state["elapsed_s"]
-    order = np.zeros(0)
+    order = np.zeros(0, dtype=np.int64)
     share = _share(iteration, clock() - began_s, settings)
     while share < 1.0 and state["worse"] < PATIENCE:
         epoch, step = divmod(iteration, per_epoch)

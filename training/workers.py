@@ -36,7 +36,8 @@ def run(task: Callable[[Item], None], items: list[Item], jobs: int) -> Iterator[
     waiting = iter(items)
     # spawn: a fork would copy the locks of whatever threads run here
     context = multiprocessing.get_context("spawn")
-    processes, busy = [], set()
+    processes = []
+    busy: list[Connection] = []
     try:
         with _one_thread_each():
             for _ in range(min(jobs, len(items))):
@@ -46,13 +47,14 @@ def run(task: Callable[[Item], None], items: list[Item], jobs: int) -> Iterator[
                 theirs.close()
                 processes.append(process)
                 ours.send(next(waiting))
-                busy.add(ours)
+                busy.append(ours)
         while busy:
-            for connection in wait(list(busy)):
+            ready = wait(busy)
+            for connection in [each for each in busy if each in ready]:
                 item = _answer(connection)
                 following = next(waiting, None)
                 if following is None:
-                    busy.discard(connection)
+                    busy.remove(connection)
                     connection.close()
                 else:
                     connection.send(following)
