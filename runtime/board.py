@@ -36,6 +36,8 @@ from modsoft.runtime.robot import Robot
 
 ARM_WAIT_S = 4.0  # a second of heartbeats, and the ramp of a vent before
 ARM_AGAIN_S = 0.1
+# What a former host leaves behind that went away, on a board that did not restart since; nothing to mend.
+GONE_HOST = Fault.LINK_TIMEOUT | Fault.CONTROL_TIMEOUT
 VENT_WAIT_S = 3.0
 LOST_VENT_WAIT_S = 6.0  # a board in its bootloader needs up to 5 s of silence to come back
 CLEAR_WAIT_S = 1.0
@@ -130,7 +132,7 @@ class Board:
 
     @property
     def ack_latency_s(self) -> float | None:
-        """Seconds from the writing of the last acknowledged set-points to the acknowledgement."""
+        """Seconds from the writing of the last set-points to their acknowledgement; None before that."""
         return self._link.ack_latency_s
 
     @property
@@ -161,10 +163,14 @@ class Board:
     def arm(self, robot: Robot) -> None:
         """Check the board against the robot file and open a session that drives the robot's channels; still vented.
 
-        Raises `ProtocolMismatch` when they differ, `Tripped` on a latched fault, `LostInRun`.
+        A fault that only says that a former host went away is cleared first. Raises `ProtocolMismatch` when board and
+        robot file differ, `Tripped` on any other latched fault, `LostInRun`.
         """
         channels = check_board(self.hello, robot, self.name)
         deadline = self._clock() + ARM_WAIT_S
+        self._wait(lambda: self._link.status is not None, deadline)
+        if self.status is not None and self.status.faults and not self.status.faults & ~GONE_HOST:
+            self.clear_fault()
         while True:
             self._wait(lambda: self._link.can_arm, deadline)
             self.check()

@@ -78,7 +78,7 @@ class Link:
         self.lost: str | None = None  # why, in words
         self.gave_up = False  # nothing announced itself, not even after all resets
         self.dtr = True  # what the port's DTR line should be; its rising edge resets the board
-        self.ack_latency_s: float | None = None  # of the last SET acknowledged
+        self.ack_latency_s: float | None = None  # of the last SET, once it is acknowledged in time
         self.missed_acks = 0  # in a row
         self.refused: Nack | None = None  # the answer to the last request, when it was no
         self.counts = dict.fromkeys(("bytes", "bad_frames", "refused", "sets", "missed_acks"), 0)  # for the log
@@ -105,6 +105,7 @@ class Link:
         self.tick = message.tick
         self._seq = (self._seq + 1) & 0xFF
         self._set = (self._seq, message)
+        self.ack_latency_s = None
         return self._seq
 
     def arm(self, channels: int, p_full: int) -> None:

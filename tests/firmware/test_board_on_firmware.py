@@ -213,6 +213,35 @@ def test_board_that_does_not_reset_on_opening_is_asked(new_board):
     board.arm(ROBOT)
 
 
+def test_fault_that_a_killed_host_left_behind_is_cleared_at_arming_only(new_board):
+    port = VirtualPort(new_board, reset_on_open=False)
+    first = connect(port)
+    first.arm(ROBOT)
+    run(first, port, 1)
+    port.run(2000)
+    assert port.board.faults == Fault.LINK_TIMEOUT
+    port.pending = b""
+    second = connect(port)
+    assert port.board.state == State.FAULT
+    second.arm(ROBOT)
+    assert port.board.state == State.ARMED
+    run(second, port, 1)
+    assert port.board.state == State.RUNNING
+
+
+def test_fault_that_has_a_cause_is_not_cleared_at_arming(new_board):
+    port = VirtualPort(new_board)
+    board = connect(port)
+    port.follows = False
+    port.board.measured[0] = 9000
+    port.run(200)
+    port.board.measured[0] = 0
+    port.run(200)
+    with pytest.raises(Tripped, match="OVER_PRESSURE"):
+        board.arm(ROBOT)
+    assert port.board.faults == Fault.OVER_PRESSURE
+
+
 def test_foreign_protocol_is_refused(new_board, monkeypatch):
     port = VirtualPort(new_board)
     monkeypatch.setattr("modsoft.runtime.link.PROTOCOL_HASH", 0x1234)

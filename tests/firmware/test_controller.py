@@ -316,7 +316,10 @@ def test_latched_fault_needs_the_exact_mask_and_the_pressures_down(running):
     assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # still ramping
     until_vented(running)
     assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # sensors still up
-    running.measured[:6] = [499] * 6
+    running.measured[:6] = [499] * 5 + [500]
+    running.wait(1)
+    assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE
+    running.measured[5] = 499
     running.wait(1)
     for mask in (0, Fault.LINK_TIMEOUT | Fault.LEAK, Fault.CONTROL_TIMEOUT):
         assert reason(running.tell(ClearFault(mask))) == NackReason.RANGE
