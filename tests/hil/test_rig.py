@@ -11,11 +11,13 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from modsoft.hil import judge, record
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child, Rig
+from modsoft.runtime import log
 from modsoft.runtime import robot as robots
 
 SCRIPTS = Path(sys.executable).parent
@@ -67,18 +69,35 @@ def run(folder, robot, model, steps):
         rig.run(model, "down", "--steps", str(steps))
         rig.wait(60)
         rig.settle(1.5)
-    return judge.judge(record.read(folder, rig.run_folder(), rig.robot, "down", steps, rig.runtime.returncode))
+    return record.read(folder, rig.run_folder(), rig.robot, "down", steps, rig.runtime.returncode)
+
+
+def as_in_collection(found, run_folder):
+    """Configurations at the ticks (K, N, 3) of the robot that training data comes from, given what the run applied."""
+    from modsoft.training.arm import Arm
+
+    arm = Arm(found.robot.robot.kind, found.robot.modules)
+    arm.step(np.zeros((found.robot.modules, 1)))  # the period before the first tick
+    there = []
+    for tick in log.read(run_folder).ticks:
+        there.append(arm.configuration)
+        arm.step(np.array(tick["actuation"]))
+    return np.array(there)
 
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("robot", ["pneumatic-3", "pneumatic-2"])
 def test_a_model_of_three_modules_runs_robots_of_three_and_two(robot, strong_model, tmp_path):
-    verdict = run(tmp_path, robot, strong_model, steps=20)
+    found = run(tmp_path, robot, strong_model, steps=20)
+    verdict = judge.judge(found)
     table = "\n".join(f"{line.ok}  {line.name}: {line.found} ({line.limit})" for line in verdict.acceptances)
     print(table)
     assert verdict.word == "not judged", table
     if "too slow" not in verdict.reason:
         assert all(line.ok for line in verdict.acceptances), table
+        off = judge.angle_between_deg(found.configuration, as_in_collection(found, next(tmp_path.glob("runs/*"))))
+        print(f"off the robot of the training data, same actuation: mean {off.mean():.3f}, max {off.max():.2f}°")
+        assert off.mean() < 0.3, "the rig's robot is not the one that the controller was trained on"
 
 
 @pytest.mark.realtime
