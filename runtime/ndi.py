@@ -16,6 +16,7 @@ from modsoft.runtime.tracker import Frame
 # How fast each device counts its frames, whatever share of them is asked for (NDI's API guides).
 FRAME_HZ = {"polaris": 60.0, "vega": 60.0, "aurora": 40.0}
 NETWORK_PORT = 8765
+ERRORS_IN_A_ROW = 3  # a byte that was hurt on the line is waited out, a device that was unplugged is not
 
 
 class NDI:
@@ -40,6 +41,7 @@ class NDI:
         self._period_s = 1.0 / FRAME_HZ[kind]
         self._due_s = now()
         self._newest = -1
+        self._errors = 0
         self._tracker = _connected(kind, port, _checked(kind, tools, count))
         found = len(self._tracker.get_tool_descriptions()[0])
         if found != count:
@@ -47,7 +49,8 @@ class NDI:
             raise DeviceAbsent(f"tracker at {port}: {found} tools, the robot needs {count}: base, then modules")
 
     def read(self) -> Frame | None:
-        """The next frame, at the pace at which the device makes them; None while it has no new one."""
+        """The next frame, at the pace at which the device makes them; None while it has no new one. Raises
+        `DeviceAbsent` at the third error in a row."""
         left_s = self._due_s - self._now()
         if left_s > 0:
             self._wait(left_s)
@@ -56,7 +59,11 @@ class NDI:
         try:
             _, _, numbers, poses, quality = self._tracker.get_frame()
         except OSError as error:
-            raise DeviceAbsent(f"tracker at {self._port}: {_one_line(error)}") from error
+            self._errors += 1
+            if self._errors == ERRORS_IN_A_ROW:
+                raise DeviceAbsent(f"tracker at {self._port}: {_one_line(error)}") from error
+            return None
+        self._errors = 0
         # A tool that was left out of the answer has number 0, so the newest number is the frame's.
         number = int(np.nanmax(np.asarray(numbers, dtype=np.float64)))
         if number == self._newest:

@@ -177,3 +177,50 @@ def test_the_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ndicapy", None)
     with pytest.raises(DeviceAbsent, match=r"pip install 'modsoft\[ndi\]'"):
         ndi.NDI("polaris", "/dev/null", tools, 4)
+
+
+class Client:
+    """What the NDI client gives, or raises, call by call."""
+
+    def __init__(self, answers):
+        self.answers = iter(answers)
+
+    def get_tool_descriptions(self):
+        return [[10, 11, 12, 13], []]
+
+    def get_frame(self):
+        answer = next(self.answers)
+        if isinstance(answer, Exception):
+            raise answer
+        poses = [np.eye(4)] * 4
+        return [10, 11, 12, 13], [0.0] * 4, [0.0, answer, answer, answer], poses, [0.1] * 4
+
+    def close(self):
+        pass
+
+
+def ndi_with(monkeypatch, tmp_path, answers):
+    tools = [tmp_path / f"{n}.rom" for n in range(4)]
+    for path in tools:
+        path.touch()
+    monkeypatch.setattr(ndi, "_connected", lambda *told: Client(answers))
+    clock = [0.0]
+    return ndi.NDI("polaris", "port", tools, 4, lambda: clock[0], lambda s: clock.__setitem__(0, clock[0] + s)), clock
+
+
+def test_a_hurt_answer_is_waited_out_and_three_in_a_row_are_not(monkeypatch, tmp_path):
+    bad = OSError("Error 0x0101: Bad CRC on reply\n   and more")
+    source, _ = ndi_with(monkeypatch, tmp_path, [5.0, bad, bad, 6.0, bad, bad, bad])
+    assert source.read().device_frame == 5
+    assert [source.read(), source.read()] == [None, None]
+    assert source.read().device_frame == 6
+    assert [source.read(), source.read()] == [None, None]
+    with pytest.raises(DeviceAbsent, match=r"tracker at port: Error 0x0101: Bad CRC on reply$"):
+        source.read()
+
+
+def test_frames_are_asked_for_at_the_devices_pace(monkeypatch, tmp_path):
+    source, clock = ndi_with(monkeypatch, tmp_path, [float(n) for n in range(1, 100)])
+    for _ in range(61):
+        source.read()
+    assert clock[0] == pytest.approx(1.0)
