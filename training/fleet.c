@@ -15,21 +15,18 @@ struct plant {
     int64_t actuators;            /* that act on a module at a time */
     int64_t axis[MOST_ACTUATORS]; /* 0 or 1: the director that each of them stands along */
     int64_t lags;                 /* whether the actuators follow their goal late */
-    int64_t wall;                 /* whether the wall stiffens or rubs */
-    int64_t stiffening_half_powers;
     double time_step;
     double rest_length;         /* of an element */
     double inverse_rest_length; /* of an element */
     double volume_over_pi;      /* of an element */
     double shear, stretch;      /* stiffness of a section, N */
-    double bend[3];             /* N m^2, the last is twist */
+    double bend[3];             /* N m^2 at rigidity 1, the last is twist */
     double half_damping;        /* N s/m^2: each of an element's two nodes takes half */
     double drag[3];             /* on (radius * length) |u| u, half of it likewise */
     double weight[4];           /* of an actuator's stress, powers of its stretch */
     double longest;             /* stretch beyond which an actuator is slack */
     double valve_share, chamber_share; /* of the way to go, a time step */
-    double inverse_stiffening_tension; /* 1/N */
-    double friction, friction_curvature; /* N m^2, 1/m */
+    double friction, friction_curvature; /* of the wall, N m^2, and where it slips, 1/m */
     double gravity_kick;        /* m/s a time step */
     double gyration[3];         /* time step of the rotational kick, s, of each axis */
     double turn_kick[3];        /* rad/s for a torque of 1 N m */
@@ -102,19 +99,20 @@ int fleet_plant_bytes(void) { return (int)sizeof(struct plant); }
 /* Advances `blocks` blocks of robots of `modules` modules by `steps` time steps.
  *
  * mobility (elements + 1): time step over the mass of a node, s/kg.
+ * rigidity (elements - 1): of a Voronoi domain, over that of the others of its kind.
  * drive (blocks, modules, actuators, 4, lanes): struct drive.
  * state (blocks, elements + 1, 20, lanes): struct element, k beside the node before it; the last node has no element.
  * Both start on a multiple of 8 * lanes bytes.
  */
 void fleet_advance(int variant, const struct plant *plant, int blocks, int modules, int per_module,
-                   const double *mobility, double *drive, double *state, long steps)
+                   const double *mobility, const double *rigidity, double *drive, double *state, long steps)
 {
     for (int b = 0; b < blocks; b++) {
         switch (variant) {
-        case 0: advance_plain(plant, b, modules, per_module, mobility, drive, state, steps); break;
+        case 0: advance_plain(plant, b, modules, per_module, mobility, rigidity, drive, state, steps); break;
 #if defined(__x86_64__)
-        case 1: advance_avx2(plant, b, modules, per_module, mobility, drive, state, steps); break;
-        case 2: advance_avx512(plant, b, modules, per_module, mobility, drive, state, steps); break;
+        case 1: advance_avx2(plant, b, modules, per_module, mobility, rigidity, drive, state, steps); break;
+        case 2: advance_avx512(plant, b, modules, per_module, mobility, rigidity, drive, state, steps); break;
 #endif
         }
     }

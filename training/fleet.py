@@ -82,6 +82,7 @@ class Fleet:
         mass[self.plant.elements :: self.plant.elements] += self.plant.connector_mass_kg
         mass[-1] += self.plant.tip_mass_kg - self.plant.connector_mass_kg
         self._mobility = self.time_step_s / mass
+        self._rigidity = np.ascontiguousarray(self.plant.bend_ratios(modules))
         # Newtons of a pascal at weight 1.
         self._section_m2 = self.plant.actuators.area_ratio * area
         self._threads = ThreadPoolExecutor(threads) if threads > 1 else None
@@ -157,10 +158,16 @@ class Fleet:
             raise ValueError(f"{duration_s} s is not a whole number of time steps of {self.time_step_s} s")
 
         def advance(block: slice) -> None:
+            arrays = (self._mobility, self._rigidity, drive[block], state[block])
             self._library.fleet_advance(
-                self._variant, ctypes.byref(plant), len(state[block]), self.modules, self.plant.elements,
-                self._mobility.ctypes.data, drive[block].ctypes.data, state[block].ctypes.data, steps,
-            )  # fmt: skip
+                self._variant,
+                ctypes.byref(plant),
+                len(state[block]),
+                self.modules,
+                self.plant.elements,
+                *(array.ctypes.data for array in arrays),
+                steps,
+            )
 
         if self._threads is None:
             advance(slice(None))

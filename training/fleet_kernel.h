@@ -105,7 +105,8 @@ INLINE void NAME(geometry)(const struct plant *p, ELEMENT *e, WORK *o, double h)
 
 /* B: curvature between the elements a and b, b's work; asin(x)/x as a series in x^2 = t. Relative error below 2e-15 for
  * 0.3 rad between two elements, 2e-12 for 0.4, 2e-10 for 0.5; a robot that bends more sharply is made non-finite. */
-INLINE void NAME(curvature)(const struct plant *p, const ELEMENT *a, const ELEMENT *b, const WORK *oa, WORK *o)
+INLINE void NAME(curvature)(const struct plant *p, double rigidity, const ELEMENT *a, const ELEMENT *b, const WORK *oa,
+                            WORK *o)
 {
     const V *f = a->director, *g = b->director;
     V z[3];
@@ -119,7 +120,7 @@ INLINE void NAME(curvature)(const struct plant *p, const ELEMENT *a, const ELEME
     V c = (V)((M)((0.5 * p->inverse_rest_length) * s) | (M)(t > 0.23));
     V inverse = 2.0 / (oa->length + o->length);
     V squeeze = p->rest_length * inverse;
-    V cube = squeeze * squeeze * squeeze;
+    V cube = rigidity * (squeeze * squeeze * squeeze);
     V quarter = 0.25 * (oa->radius + o->radius);
     for (int i = 0; i < 3; i++) {
         o->kappa[i] = c * z[i];
@@ -154,16 +155,10 @@ INLINE void NAME(pull)(const struct plant *p, int axis, const DRIVE *drive, cons
     }
 }
 
-/* What the wall adds to the bending couple m: it stiffens under tension, and its friction holds the curvature back by a
- * spring whose other end slips. */
-INLINE void NAME(wall)(const struct plant *p, const V *kappa, V tension, V *slip, V *m)
+/* What the friction of the wall adds to the bending couple m: a spring whose other end slips. */
+INLINE void NAME(rub)(const struct plant *p, const V *kappa, V *slip, V *m)
 {
     const V one = (V){0} + 1.0;
-    V pull = (V)((M)(tension * p->inverse_stiffening_tension) & (M)(tension > 0.0));
-    V more = p->stiffening_half_powers % 2 ? NAME(root)(pull) : one;
-    for (int i = 0; i < p->stiffening_half_powers / 2; i++)
-        more *= pull;
-    more *= p->bend[0];
     V d0 = kappa[0] - slip[0], d1 = kappa[1] - slip[1];
     V far = NAME(root)(d0 * d0 + d1 * d1);
     M slips = (M)(far > p->friction_curvature);
@@ -172,12 +167,12 @@ INLINE void NAME(wall)(const struct plant *p, const V *kappa, V tension, V *slip
     d1 *= held;
     slip[0] = (V)(((M)(kappa[0] - d0) & slips) | ((M)slip[0] & ~slips));
     slip[1] = (V)(((M)(kappa[1] - d1) & slips) | ((M)slip[1] & ~slips));
-    m[0] += more * kappa[0] + p->friction * d0;
-    m[1] += more * kappa[1] + p->friction * d1;
+    m[0] += p->friction * d0;
+    m[1] += p->friction * d1;
 }
 
 /* C: actuators, forces on the two nodes, and the couple towards the element before. */
-INLINE void NAME(forces)(const struct plant *p, int wall, const DRIVE *drive, ELEMENT *e, const WORK *before, WORK *o,
+INLINE void NAME(forces)(const struct plant *p, int rubs, const DRIVE *drive, ELEMENT *e, const WORK *before, WORK *o,
                          const WORK *after)
 {
     const V *q = e->director;
@@ -203,8 +198,8 @@ INLINE void NAME(forces)(const struct plant *p, int wall, const DRIVE *drive, EL
         m[i] = o->couple[i] + 0.5 * (before->pair[i] + pair[i]);
     }
     const V *k = o->kappa;
-    if (wall)
-        NAME(wall)(p, k, 0.5 * (before->force[2] + n[2]), e->slip, m);
+    if (rubs)
+        NAME(rub)(p, k, e->slip, m);
     double half = 0.5 * p->rest_length;
     for (int i = 0; i < 3; i++)
         o->moment[i] = m[i];
@@ -233,8 +228,8 @@ INLINE void NAME(kick)(const struct plant *p, double mobility, ELEMENT *e, const
 }
 
 /* One time step: drift by h, then kick. The first node and element are clamped: at rest, and never kicked. */
-INLINE void NAME(sweep)(const struct plant *p, int wall, int elements, int per_module, const double *mobility,
-                        const DRIVE *drive, ELEMENT *e, double h)
+INLINE void NAME(sweep)(const struct plant *p, int rubs, int elements, int per_module, const double *mobility,
+                        const double *rigidity, const DRIVE *drive, ELEMENT *e, double h)
 {
     WORK ring[RING];
 #define AT(k) (ring + ((k) & (RING - 1)))
@@ -244,11 +239,11 @@ INLINE void NAME(sweep)(const struct plant *p, int wall, int elements, int per_m
         if (k < elements)
             NAME(geometry)(p, e + k, AT(k), h);
         if (k > 0 && k < elements)
-            NAME(curvature)(p, e + k - 1, e + k, AT(k - 1), AT(k));
+            NAME(curvature)(p, rigidity[k - 1], e + k - 1, e + k, AT(k - 1), AT(k));
         else if (k == elements)
             *AT(k) = (WORK){0}; /* nor after the last one */
         if (c >= 0 && c < elements)
-            NAME(forces)(p, wall, drive + p->actuators * (c / per_module), e + c, AT(c - 1), AT(c), AT(c + 1));
+            NAME(forces)(p, rubs, drive + p->actuators * (c / per_module), e + c, AT(c - 1), AT(c), AT(c + 1));
         if (c == 0)
             for (int i = 0; i < 3; i++)
                 AT(0)->moment[i] = AT(0)->turn[i] = (V){0};
@@ -271,7 +266,7 @@ INLINE void NAME(follow)(const struct plant *p, int drives, DRIVE *drive)
 }
 
 static void NAME(advance)(const struct plant *p, int block, int modules, int per_module, const double *mobility,
-                          double *drives, double *state, long steps)
+                          const double *rigidity, double *drives, double *state, long steps)
 {
     int elements = modules * per_module;
     ELEMENT *e = (ELEMENT *)state + (long)block * (elements + 1);
@@ -280,10 +275,10 @@ static void NAME(advance)(const struct plant *p, int block, int modules, int per
     for (long s = 0; s < steps; s++) {
         if (p->lags)
             NAME(follow)(p, modules * p->actuators, drive);
-        if (p->wall)
-            NAME(sweep)(p, 1, elements, per_module, mobility, drive, e, h);
+        if (p->friction > 0.0)
+            NAME(sweep)(p, 1, elements, per_module, mobility, rigidity, drive, e, h);
         else
-            NAME(sweep)(p, 0, elements, per_module, mobility, drive, e, h);
+            NAME(sweep)(p, 0, elements, per_module, mobility, rigidity, drive, e, h);
         h = p->time_step;
     }
     h = steps ? 0.5 * p->time_step : 0.0;

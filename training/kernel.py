@@ -26,8 +26,6 @@ class PlantStruct(ctypes.Structure):
         ("actuators", ctypes.c_int64),
         ("axis", ctypes.c_int64 * MOST_ACTUATORS),
         ("lags", ctypes.c_int64),
-        ("wall", ctypes.c_int64),
-        ("stiffening_half_powers", ctypes.c_int64),
         ("time_step", ctypes.c_double),
         ("rest_length", ctypes.c_double),
         ("inverse_rest_length", ctypes.c_double),
@@ -41,7 +39,6 @@ class PlantStruct(ctypes.Structure):
         ("longest", ctypes.c_double),
         ("valve_share", ctypes.c_double),
         ("chamber_share", ctypes.c_double),
-        ("inverse_stiffening_tension", ctypes.c_double),
         ("friction", ctypes.c_double),
         ("friction_curvature", ctypes.c_double),
         ("gravity_kick", ctypes.c_double),
@@ -60,10 +57,8 @@ def library() -> ctypes.CDLL | None:
     found = ctypes.CDLL(spec.origin)
     if found.fleet_plant_bytes() != ctypes.sizeof(PlantStruct):
         raise ModsoftError(f"{spec.origin} is not of this version of modsoft; install it again (make install)")
-    pointer = ctypes.c_void_p
-    found.fleet_advance.argtypes = (
-        [ctypes.c_int, pointer, ctypes.c_int, ctypes.c_int, ctypes.c_int, pointer, pointer, pointer, ctypes.c_long]
-    )  # fmt: skip
+    integer, pointer = ctypes.c_int, ctypes.c_void_p
+    found.fleet_advance.argtypes = [integer, pointer, integer, integer, integer, *[pointer] * 4, ctypes.c_long]
     found.fleet_advance.restype = None
     found.fleet_peak.argtypes = [ctypes.c_int, ctypes.c_long]
     found.fleet_peak.restype = ctypes.c_double
@@ -96,17 +91,12 @@ def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct
     axes, _ = places(plant)
     lags = (actuators.valve_lag_s, actuators.chamber_lag_s)
     shares = [1.0 - math.exp(-time_step_s / lag) if lag else 1.0 for lag in lags]
-    half_powers = 2 * plant.stiffening_power
-    if half_powers not in range(1, 17):
-        raise ModsoftError(f"stiffening_power is {plant.stiffening_power}, expected 0.5, 1, 1.5 ... 8")
     if len(actuators.weight) > 4:
         raise ModsoftError(f"an actuator's weight has {len(actuators.weight)} coefficients, expected at most 4")
     return PlantStruct(
         actuators=len(axes),
         axis=tuple(axes),
         lags=any(lags),
-        wall=plant.friction_n_m2 > 0 or math.isfinite(plant.stiffening_tension_n),
-        stiffening_half_powers=int(half_powers),
         time_step=time_step_s,
         rest_length=length,
         inverse_rest_length=1 / length,
@@ -120,7 +110,6 @@ def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct
         longest=actuators.longest,
         valve_share=shares[0],
         chamber_share=shares[1],
-        inverse_stiffening_tension=1 / plant.stiffening_tension_n,
         friction=plant.friction_n_m2,
         friction_curvature=plant.friction_curvature_per_m,
         gravity_kick=time_step_s * plant.gravity_m_s2,
