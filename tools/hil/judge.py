@@ -138,6 +138,7 @@ def tracking_error_deg(record: Record) -> Array:
 def valve_difference(record: Record) -> Array:
     """Largest difference (K,) of timer registers from what the log says was commanded, in counts, over all channels
     and all the time from when the slew must have settled until the next tick starts. NaN: no such time."""
+    assert record.robot.valve is not None  # the rig runs no other robots
     scale = record.valves.counts / record.robot.valve.full_scale_bar
     channels = record.valves.duty.shape[1]
     if record.commanded_bar[:, channels:].any():

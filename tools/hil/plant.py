@@ -46,17 +46,21 @@ BASE_IN_TRACKER[:3, 3] = [60.0, -110.0, -1400.0]  # mm
 class PneumaticArm(Protocol):
     """What the plant asks of `modsoft.training.arm.Arm`."""
 
-    configuration: Array  # (N, 3)
-    positions: Array  # (N, 3), m
-    directors: Array  # (N, 3, 3), rows d1, d2, d3
-    pressures: Array  # (N, 2), bar, in the chambers
-
+    @property
+    def configuration(self) -> Array: ...  # (N, 3)
+    @property
+    def positions(self) -> Array: ...  # (N, 3), m
+    @property
+    def directors(self) -> Array: ...  # (N, 3, 3), rows d1, d2, d3
+    @property
+    def pressures(self) -> Array: ...  # (N, 2), bar, in the chambers
     def set_pressures(self, bar: Array) -> None: ...
     def advance(self, duration_s: float) -> None: ...
 
 
 def set_points_bar(robot: Robot, duty: Array) -> Array:
     """Set-points of the chambers (N, 2), sides + and -, bar, from the duty of each valve channel (channels,)."""
+    assert robot.valve is not None  # load_robot takes no other
     set_points = np.zeros((robot.modules, 2))
     for chamber in robot.chambers:
         share = duty[chamber.channel] if chamber.channel < len(duty) else 0.0

@@ -24,7 +24,8 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, steps: int, ru
     """The record of a run from the rig's `folder` and from the runtime's own, `run` (None: it never made one)."""
     events = lines(folder / "board.jsonl")
     plant = lines(folder / "plant.jsonl")
-    ticks, told = [], []
+    ticks: list[Line] = []
+    told: list[Line] = []
     if run is not None:
         _, ticks, told = log.read(run)
     end = next((event for event in told if event["event"] == "end"), None)

@@ -142,7 +142,7 @@ def picture(record: Record) -> Figure:
     at_tick, at_slice = (record.mono_ns - start) * 1e-9, (record.plant_mono_ns - start) * 1e-9
     figure = Figure(figsize=(5.2 * modules, 7.0), layout="constrained")
     panels = figure.subplots(2, modules, sharex=True, squeeze=False)
-    channels = {(c.module - 1, c.side): c.channel for c in record.robot.chambers}
+    channels = {f"{c.module}{c.side}": c.channel for c in record.robot.chambers}
     for module in range(modules):
         above, below = panels[:, module]
         true = bending_angle_deg(record.plant_configuration[:, module])
@@ -155,7 +155,7 @@ def picture(record: Record) -> Figure:
         above.set_title(f"module {module + 1}: mean error {error:.2f}°")
         above.grid(alpha=0.3)
         for side, colour in (("+", "#2ca02c"), ("-", "#9467bd")):
-            commanded = record.commanded_bar[:, channels[module, side]]
+            commanded = record.commanded_bar[:, channels[f"{module + 1}{side}"]]
             inside = record.plant_bar[:, module, "+-".index(side)]
             below.step(at_tick, commanded, where="post", color=colour, lw=1.4, label=f"chamber {side}, commanded")
             below.plot(at_slice, inside, color=colour, lw=0.9, alpha=0.5, label=f"chamber {side}, inside")

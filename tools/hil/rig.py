@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, cast
 
 from modsoft.hil.emulator import EmulatedBoard
 from modsoft.hil.plant import load_robot
@@ -56,6 +56,8 @@ class Child:
             stderr=self._stderr,
             start_new_session=True,  # a Ctrl-C at the terminal is for the rig, which ends its children in order
         )
+        # Popen's own are optional, for processes without pipes.
+        self._input, self._output = cast(IO[bytes], self.process.stdin), cast(IO[bytes], self.process.stdout)
         self._reader = threading.Thread(target=self._read, name=self.name, daemon=True)
         self._reader.start()
 
@@ -69,8 +71,8 @@ class Child:
     def send(self, line: Line) -> None:
         """One line to the process. One that has ended is noticed by `check`, not here."""
         with contextlib.suppress(BrokenPipeError, ValueError), self._sending:
-            self.process.stdin.write(json.dumps(line).encode() + b"\n")
-            self.process.stdin.flush()
+            self._input.write(json.dumps(line).encode() + b"\n")
+            self._input.flush()
 
     def check(self) -> None:
         """`LostInRun` when the process ended by itself."""
@@ -85,18 +87,18 @@ class Child:
     def stop(self) -> None:
         """Ends the process: at the end of its input, or else by force."""
         with contextlib.suppress(BrokenPipeError), self._sending:
-            self.process.stdin.close()
+            self._input.close()
         try:
             self.process.wait(STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
         self._reader.join()
-        self.process.stdout.close()
+        self._output.close()
         self._stderr.close()
 
     def _read(self) -> None:
-        for text in self.process.stdout:
+        for text in self._output:
             line = json.loads(text)
             if line["event"] == "ready":
                 self._ready.set()
@@ -118,9 +120,9 @@ class Rig:
         self.folder = folder
         self.runs = folder / "runs"
         self.board = EmulatedBoard(board, on_event=self._board_event)
-        self.plant: Child | None = None
-        self.tracker: Child | None = None
-        self.runtime: subprocess.Popen[bytes] | None = None
+        self.plant: Child
+        self.tracker: Child
+        self.runtime: subprocess.Popen[bytes]
         self.plant_states: list[Line] = []
         self._changed = threading.Event()
         self._closing = threading.Event()
@@ -147,7 +149,6 @@ class Rig:
             forwarder.start()
             exits.callback(forwarder.join)
             exits.callback(self._closing.set)
-            exits.callback(self._stop_runtime)
             self._exits = exits.pop_all()
         return self
 
@@ -179,6 +180,7 @@ class Rig:
             self.runtime = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=errors, start_new_session=True
             )
+        self._exits.callback(_stop_runtime, self.runtime)
         return self.runtime
 
     def wait(self, timeout_s: float, progress: Callable[[int], None] = lambda ticks: None) -> int:
@@ -218,16 +220,6 @@ class Rig:
         lines = (self.folder / "runtime.err").read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
 
-    def _stop_runtime(self) -> None:
-        if self.runtime is None or self.runtime.poll() is not None:
-            return
-        self.runtime.send_signal(signal.SIGINT)
-        try:
-            self.runtime.wait(RUNTIME_STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self.runtime.kill()
-            self.runtime.wait()
-
     # ---- Lines passed on
 
     def _board_event(self, event: Line) -> None:
@@ -250,6 +242,18 @@ class Rig:
                     self.board.send(f"adc {channel} {self.board.millivolt(pressure_bar)}")
         self.plant_states.append(state)
         _write(self._plant_log, state)
+
+
+def _stop_runtime(process: subprocess.Popen[bytes]) -> None:
+    """As Ctrl-C would: it vents, closes its log and ends. By force where it does not."""
+    if process.poll() is not None:
+        return
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(RUNTIME_STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def _write(log: IO[str], line: Line) -> None:
