@@ -42,7 +42,6 @@ class _Loads(elastica.NoForces):
             np.full(len(angles), actuators.area_ratio * np.pi * plant.radius_m**2),
             np.array(actuators.weight),
             actuators.longest,
-            np.array([plant.stiffening_tension_n, plant.stiffening_power]),
             np.array([plant.friction_n_m2, plant.friction_curvature_per_m]),
         )
         self._state = state
@@ -66,8 +65,6 @@ class _Loads(elastica.NoForces):
             system.tangents,
             system.sigma,
             system.kappa,
-            system.shear_matrix,
-            system.bend_matrix,
             system.director_collection,
             system.velocity_collection,
             system.omega_collection,
@@ -173,7 +170,10 @@ class Arm:
             density=plant.density_kg_m3,
             youngs_modulus=plant.youngs_modulus_pa,
         )
-        rod.shear_matrix[2, 2] *= plant.axial_stiffening
+        rod.shear_matrix[2, 2] *= plant.axial_ratio
+        rod.bend_matrix *= plant.bend_ratios(self.modules)
+        rod.mass_second_moment_of_inertia *= plant.rotary_inertia_ratio
+        rod.inv_mass_second_moment_of_inertia /= plant.rotary_inertia_ratio
         rod.mass[plant.elements :: plant.elements] += plant.connector_mass_kg
         rod.mass[-1] += plant.tip_mass_kg - plant.connector_mass_kg
         simulator = _Simulator()
@@ -190,10 +190,11 @@ class Arm:
 
     def _keep_rest(self) -> None:
         """Lets the arm settle under its weight, then keeps what `reset` puts back."""
-        self.advance(self.plant.settling_s)
         rod = self._rod
-        rod.velocity_collection[:] = 0.0
-        rod.omega_collection[:] = 0.0
+        for duration_s in self.plant.settling_slices_s():
+            self.advance(duration_s)
+            rod.velocity_collection[:] = 0.0
+            rod.omega_collection[:] = 0.0
         arrays = [rod.position_collection, rod.director_collection, rod.velocity_collection, rod.omega_collection]
         self._rest = [(array, array.copy()) for array in [*arrays, *self._state.values()]]
         self.reset()

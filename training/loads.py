@@ -35,7 +35,6 @@ def add_loads(
     areas: Array,
     weight: Array,
     longest: float,
-    stiffening: Array,
     friction: Array,
     stress: Array,
     slip: Array,
@@ -48,8 +47,6 @@ def add_loads(
     tangents: Array,
     sigma: Array,
     kappa: Array,
-    shear_matrix: Array,
-    bend_matrix: Array,
     directors: Array,
     velocity: Array,
     omega: Array,
@@ -70,16 +67,14 @@ def add_loads(
     couple r x n averaged to the Voronoi domains: the longitudinal muscle of Chang, Halder et al. The internal force of
     the rod is one continuous field, so that the stress may jump at the border of two modules.
 
-    stiffening (2,): tension_n and power; the bending rigidity B grows to B (1 + (tension / tension_n)^power).
     friction (2,): stiffness, N m^2, and curvature, 1/m, of a spring in each Voronoi domain that follows the bending
     curvature by its end `slip` (2, n - 1), 1/m, which is dragged along beyond that curvature: dry friction, the
-    hysteresis of the material. `slip` is updated. Both are off at stiffness 0 and tension_n infinite.
+    hysteresis of the material. `slip` is updated; at stiffness 0 there is none.
 
     The others are PyElastica's arrays of those names, SI units.
     """
     n = lengths.shape[0]
     per_module = n // stress.shape[0]
-    stiffens = np.isfinite(stiffening[0])
     rubs = friction[0] > 0.0
     for k in range(n + 1):
         forces[2, k] += gravity * mass[k]
@@ -109,7 +104,7 @@ def add_loads(
 
     # One sweep: force n and couple about the centre line p of element k (material frame), summed over its actuators;
     # then, with the element before it, the Voronoi couple m between the two and what of it each of them feels.
-    before0 = before1 = before2 = tension_before = 0.0
+    before0 = before1 = before2 = 0.0
     for k in range(n):
         n0 = n1 = n2 = p0 = p1 = p2 = 0.0
         for c in range(offsets.shape[0]):
@@ -150,16 +145,10 @@ def add_loads(
         torques[0, k] += (a1 * n2 - a2 * n1) * lengths[k]
         torques[1, k] += (a2 * n0 - a0 * n2) * lengths[k]
         torques[2, k] += (a0 * n1 - a1 * n0) * lengths[k]
-        tension = shear_matrix[2, 2, k] * sigma[2, k] / dilatation[k] + n2  # what hangs below: wall and actuators
 
         if k > 0:
             j = k - 1
             m0, m1, m2 = 0.5 * (before0 + p0), 0.5 * (before1 + p1), 0.5 * (before2 + p2)
-            if stiffens:
-                pull = max(0.5 * (tension_before + tension), 0.0) / stiffening[0]
-                more = bend_matrix[0, 0, j] * pull ** stiffening[1]
-                m0 += more * kappa[0, j]
-                m1 += more * kappa[1, j]
             if rubs:
                 d0, d1 = kappa[0, j] - slip[0, j], kappa[1, j] - slip[1, j]
                 far = np.sqrt(d0 * d0 + d1 * d1)
@@ -180,4 +169,4 @@ def add_loads(
             torques[0, k] += c0 - m0
             torques[1, k] += c1 - m1
             torques[2, k] += c2 - m2
-        before0, before1, before2, tension_before = p0, p1, p2, tension
+        before0, before1, before2 = p0, p1, p2

@@ -8,7 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from msgspec.structs import fields
+from numpy.typing import NDArray
+
+from modsoft.runtime.robot import Valve
+
 PASCAL_PER_BAR = 1e5
+# Chamber pressures at activation 0 and 1: what a robot file means that does not say otherwise.
+P_MIN_BAR, P_MAX_BAR = (each.default for each in fields(Valve) if each.name in ("p_min_bar", "p_max_bar"))
 
 
 @dataclass(frozen=True)
@@ -49,14 +57,41 @@ class Plant:
     period_s: float  # control period
     drag_transverse: float = 0.0  # 0.5 * this / (radius * rest element length) * 2 r l |v| v, per transverse axis
     drag_axial: float = 0.0  # the same along the axis (pi in the wetted area and in its reference cancel)
-    axial_stiffening: float = 1.0  # axial stiffness over Young's modulus times section
+    axial_ratio: float = 1.0  # axial stiffness over Young's modulus times section
+    rotary_inertia_ratio: float = 1.0  # over that of a full round section
     connector_mass_kg: float = 0.0  # lumped at the end of every module but the last
     tip_mass_kg: float = 0.0  # lumped at the end of the last module
-    stiffening_tension_n: float = float("inf")  # bending rigidity times 1 + (tension / this)^power
+    stiffening_weight_n: float = float("inf")  # see bend_ratios
     stiffening_power: float = 1.0
+    stiffest_ratio: float = float("inf")
     friction_n_m2: float = 0.0  # bending rigidity of the friction spring, and the curvature at which it slips
     friction_curvature_per_m: float = 0.0
-    settling_s: float = 0.0  # until the arm hangs still
+    settling_slices: int = 0  # until the arm hangs still, see settling_slices_s
+
+    def bend_ratios(self, modules: int) -> NDArray[np.float64]:
+        """Rigidity against bending and twist in the Voronoi domains (elements - 1,), over that of a free section.
+
+        The wall of a module stiffens under the weight W that hangs from its end: 1 + (W / `stiffening_weight_n`) ^
+        `stiffening_power`, but `stiffest_ratio` at most; the mean of both modules at their border. The weight at rest
+        is taken, once and for all: were it the momentary tension, a law without an energy would feed the vibrations
+        along the axis until the arm flew apart.
+        """
+        module_kg = self.density_kg_m3 * np.pi * self.radius_m**2 * self.module_length_m
+        below = np.arange(modules)[::-1]
+        hanging_n = self.gravity_m_s2 * (below * (module_kg + self.connector_mass_kg) + self.tip_mass_kg)
+        ratios = 1.0 + (hanging_n / self.stiffening_weight_n) ** self.stiffening_power
+        of_element = np.repeat(np.minimum(ratios, self.stiffest_ratio), self.elements)
+        return 0.5 * (of_element[1:] + of_element[:-1])
+
+    def settling_slices_s(self) -> list[float]:
+        """How an arm is brought to hang still: simulated for these times, with all motion taken away after each.
+
+        The damping acts on an element's mean velocity, so that neighbours swinging against each other would swing on
+        for minutes. The times are uneven (golden section), so that no frequency is spared, and begin short, so that the
+        fall from the straight rod does not overshoot.
+        """
+        slices = [0.1 * min(1.0, (k + 1) / 20) * (0.5 + 0.6180339887 * k % 1.0) for k in range(self.settling_slices)]
+        return [round(each / self.time_step_s) * self.time_step_s for each in slices]
 
 
 # The robot of the paper's simulations, to the digit (section 2; stated by the authors' published runs). The drag is
@@ -84,32 +119,41 @@ CABLE = Plant(
     drag_axial=0.033,
 )
 
+# A robot like that of section 3.1: two opposite chambers a module between stiff connectors, hanging from a stick. The
+# paper gives pressures and reach, not the modules; these are chosen so that three modules reach 6, 36 and over 90
+# degrees, base first, and the tasks stay within the pressures. Density and modulus are those of a hollow section of
+# soft silicone; the connectors' inertia is spread over the module. Linear damping stands for the losses in the wall.
 PNEUMATIC = Plant(
-    module_length_m=0.07,
-    elements=8,
+    module_length_m=0.054,
+    elements=6,
     radius_m=0.015,
-    density_kg_m3=1070.0,
-    youngs_modulus_pa=20e3,
+    density_kg_m3=300.0,
+    youngs_modulus_pa=97e3,
     gravity_m_s2=9.81,
-    damping_n_s_m2=3.0,
-    torque_damping_n_s=0.06,
+    damping_n_s_m2=6.0,
+    torque_damping_n_s=0.02,
     actuators=Actuators(
-        angles_deg=(180.0, 0.0),
-        offset_ratio=0.6,
-        area_ratio=0.2,
-        rest_stress_pa=-0.08 * PASCAL_PER_BAR,
-        full_stress_pa=-0.35 * PASCAL_PER_BAR,
-        weight=(-44.66, 83.48, -37.83),
+        angles_deg=(180.0, 0.0),  # a chamber pushes: the one at -x bends the module towards +x
+        offset_ratio=0.7,
+        area_ratio=0.24,
+        rest_stress_pa=-P_MIN_BAR * PASCAL_PER_BAR,
+        full_stress_pa=-P_MAX_BAR * PASCAL_PER_BAR,
+        weight=(-10.5, 18.0, -6.5),  # 1 at rest; grows as the chamber bulges
         valve_lag_s=0.03,
-        chamber_lag_s=0.05,
+        chamber_lag_s=0.06,
     ),
-    time_step_s=5e-4,
+    time_step_s=2.5e-4,
     period_s=0.4,
-    connector_mass_kg=0.096,
-    tip_mass_kg=0.002,
-    friction_n_m2=1e-4,
-    friction_curvature_per_m=1.0,
-    settling_s=4.0,
+    axial_ratio=1.8,
+    rotary_inertia_ratio=5.0,
+    connector_mass_kg=0.0035,
+    tip_mass_kg=0.0005,
+    stiffening_weight_n=0.1518,
+    stiffening_power=3.0,
+    stiffest_ratio=9.0,  # the third module from the tip has 8.6
+    friction_n_m2=1.3e-3,
+    friction_curvature_per_m=1.9,
+    settling_slices=60,
 )
 
 PLANTS = {"cable": CABLE, "pneumatic": PNEUMATIC}
