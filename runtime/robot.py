@@ -39,7 +39,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """A table of the robot file: every key is known, nothing changes after reading."""
 
 
-class Identity(Section):
+class Identity(Section, frozen=True):
     """`[robot]`"""
 
     name: Name
@@ -47,7 +47,7 @@ class Identity(Section):
     modules: Annotated[int, Meta(ge=2, le=64)]  # one module has no label: eq. (1) divides by N - 1
 
 
-class Valve(Section):
+class Valve(Section, frozen=True):
     """`[valve]`: the pressure regulators. Activation 0 is `p_min_bar`, activation 1 is `p_max_bar` (section 3.1)."""
 
     model: str
@@ -57,7 +57,7 @@ class Valve(Section):
     p_max_bar: Bar = 0.35
 
 
-class Chamber(Section):
+class Chamber(Section, frozen=True):
     """`[[chambers]]`: which valve channel inflates which chamber, and what corrects that chamber's pressure.
 
     side `+` inflates for a_0 > 0, `-` for a_0 < 0 (eq. 3); pressure sent = gain * pressure + offset_bar.
@@ -70,7 +70,7 @@ class Chamber(Section):
     offset_bar: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
 
 
-class Limits(Section):
+class Limits(Section, frozen=True):
     """`[limits]`: what the loop never exceeds, and how long it goes on without a good frame."""
 
     largest_actuation_step: Annotated[float, Meta(gt=0.0, le=2.0)] = 2.0
@@ -79,23 +79,23 @@ class Limits(Section):
     invalid_frames: Annotated[int, Meta(ge=1, le=100)] = 3
 
 
-class Tracker(Section):
+class Tracker(Section, frozen=True):
     """`[tracker]`: source and its port; `tools` are the tool definition files, base first, then module 1 to N."""
 
-    source: Literal["ndi", "igtl", "replay"] = "ndi"
+    source: Literal["ndi", "replay"] = "ndi"
     type: Literal["polaris", "vega", "aurora"] = "polaris"
     port: str = ""
     tools: tuple[str, ...] = ()
 
 
-class Serial(Section):
+class Serial(Section, frozen=True):
     """`[serial]`: the board's port (empty: told on the command line)."""
 
     port: str = ""
     baud: Literal[115200, 250000, 500000, 1000000] = 250000
 
 
-class Loop(Section):
+class Loop(Section, frozen=True):
     """`[loop]`: control rate, and the task that runs when none is told."""
 
     hz: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.5
@@ -107,7 +107,7 @@ class Loop(Section):
         return 1.0 / self.hz
 
 
-class Robot(Section):
+class Robot(Section, frozen=True):
     """A whole robot file. `kind` gives the state and action sizes; a cable robot is simulated, so it has no valves."""
 
     robot: Identity
@@ -217,8 +217,8 @@ def _check(robot: Robot, where: str) -> None:
             f"full_scale_bar {valve.full_scale_bar}",
             "p_min_bar < p_max_bar <= full_scale_bar",
         )
-    wanted = Counter((module, side) for module in range(1, count + 1) for side in "+-")
-    found = Counter((chamber.module, chamber.side) for chamber in robot.chambers)
+    wanted: Counter[tuple[int, str]] = Counter((module, side) for module in range(1, count + 1) for side in "+-")
+    found: Counter[tuple[int, str]] = Counter((chamber.module, chamber.side) for chamber in robot.chambers)
     if found != wanted:
         wrong = sorted((found - wanted) + (wanted - found))
         refuse(

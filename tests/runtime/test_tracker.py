@@ -152,8 +152,6 @@ def test_what_was_not_told_is_named(tmp_path):
         open_source(with_tracker(source="replay"), "", [])
     with pytest.raises(UsageError, match=r"0 tool.*needs 4.*--tool"):
         open_source(ROBOT, "/dev/null", [])
-    with pytest.raises(UsageError, match="igtl"):
-        open_source(with_tracker(source="igtl"), "x", [])
 
 
 def test_what_is_not_there_is_named(tmp_path):
