@@ -22,15 +22,23 @@ def entry(command: click.Command) -> Callable[[], None]:
             error.show()
             sys.exit(error.exit_code)
         except (click.Abort, KeyboardInterrupt):
-            print(f"{command.name}: interrupted", file=sys.stderr)
+            _tell(f"{command.name}: interrupted")
             sys.exit(130)
         except ModsoftError as error:
-            print(f"{command.name}: {error}", file=sys.stderr)
+            _tell(f"{command.name}: {error}")
             sys.exit(error.exit_code)
         except Exception:  # noqa: BLE001 - the last stop of every command
-            traceback.print_exc()
-            print(f"{command.name}: internal error, please report it with the lines above", file=sys.stderr)
+            _tell(f"{traceback.format_exc()}{command.name}: internal error, please report it with the lines above")
             sys.exit(INTERNAL_EXIT_CODE)
         sys.exit(code if isinstance(code, int) else 0)
 
     return main
+
+
+def _tell(text: str) -> None:
+    """To standard error. Where that is a terminal that was closed, the exit code is all that can be told, and it must
+    not become Python's own for a stream that cannot be written."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except (OSError, ValueError):
+        sys.stderr = None  # else Python tries again at its end, and leaves with 120

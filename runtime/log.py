@@ -70,7 +70,8 @@ class Writer:
         self.lost = 0
         self.error: str | None = None
         self._write = write
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        binary = getattr(os, "O_BINARY", 0)  # Windows would make two bytes of each line's end
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | binary, 0o644)
         self._torn = False  # the file ends in the middle of a line
         self._queue: queue.Queue[Line | None] = queue.Queue(QUEUE_LINES)
         self._thread = threading.Thread(target=self._run, name="log", daemon=True)

@@ -141,7 +141,7 @@ class Loop:
         status, latency_s = self.valves.status, self.valves.ack_latency_s
         known = status is not None and status.acked_seq == sequence and latency_s is not None
         told = {"tick": step, "ms": latency_s * 1e3 if known and latency_s is not None else None}
-        if step >= 0:
+        if step >= 0 and status is not None:
             self.tally.acknowledged(told["ms"])
         return told
 

@@ -253,7 +253,7 @@ def _say(text: str) -> None:
     """A line for the person at the terminal, who may have left."""
     try:
         click.echo(text, err=True)
-    except OSError:
+    except (OSError, ValueError):
         pass
 
 

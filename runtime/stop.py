@@ -142,7 +142,14 @@ class Keys:
             tty.setcbreak(terminal)  # Ctrl-C stays a signal
         except (OSError, ValueError, termios.error):
             return None
-        self._restore = lambda: termios.tcsetattr(terminal, termios.TCSANOW, before)
+
+        def restore() -> None:
+            try:
+                termios.tcsetattr(terminal, termios.TCSANOW, before)
+            except termios.error:
+                pass  # the terminal was closed
+
+        self._restore = restore
 
         def read() -> str:
             if not select.select([terminal], [], [], 0.05)[0]:

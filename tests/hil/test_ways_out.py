@@ -29,15 +29,19 @@ def rig(tmp_path_factory):
 class Runtime:
     """modsoft-runtime on the rig, in the middle of a task."""
 
-    def __init__(self, rig, model, folder, stdin=subprocess.DEVNULL):
+    def __init__(self, rig, model, folder, terminal=subprocess.DEVNULL, said=None):
+        """`terminal`: its standard input, and the terminal of its session; `said`: where its words go, not a file."""
         self.rig, self.folder = rig, folder
         tools = [option for path in rig.tool_files for option in ("--tool", str(path))]
         command = [
             SCRIPT, "--yes", "--robot", "pneumatic-3", "--model", model, "--task", "down", "--port", rig.board.port,
             "--tracker-port", rig.tracker_port, *tools, "--runs-dir", folder / "runs",
         ]  # fmt: skip
-        with (folder / "said").open("wb") as said:
-            self.process = subprocess.Popen(command, stdin=stdin, stdout=said, stderr=said, start_new_session=True)
+        if terminal != subprocess.DEVNULL:
+            command = [sys.executable, "-c", OWN_TERMINAL, *command]
+        with (folder / "said").open("wb") as file:
+            said = file if said is None else said
+            self.process = subprocess.Popen(command, stdin=terminal, stdout=said, stderr=said, start_new_session=True)
         self.wait_for(lambda: self.ticks() >= 3, 15)
 
     def wait_for(self, condition, timeout_s):
@@ -99,35 +103,38 @@ def test_a_signal(rig, model_file, tmp_path, number, code):
         assert_vented(runtime, code)
 
 
-def test_the_stop_key(rig, model_file, tmp_path):
-    """On a terminal of its own, as for a person."""
-    command = (
-        "import os, sys; os.setsid() if os.getsid(0) != os.getpid() else None; import fcntl, termios; "
-        "fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
-    )
+# Makes standard input the terminal of a new session, as a terminal's window does, and becomes modsoft-runtime.
+OWN_TERMINAL = """
+import fcntl, os, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+
+
+@pytest.fixture
+def terminal():
     master, slave = os.openpty()
-    folder = tmp_path
-    tools = [option for path in rig.tool_files for option in ("--tool", str(path))]
-    with (folder / "said").open("wb") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-c", command, SCRIPT, "--yes", "--robot", "pneumatic-3", "--model", model_file, "--task",
-             "down", "--port", rig.board.port, "--tracker-port", rig.tracker_port, *tools, "--runs-dir",
-             folder / "runs"],
-            stdin=slave, stdout=said, stderr=said, start_new_session=True,
-        )  # fmt: skip
-    runtime = Runtime.__new__(Runtime)
-    runtime.rig, runtime.folder, runtime.process = rig, folder, process
-    try:
-        runtime.wait_for(lambda: runtime.ticks() >= 3, 15)
-        os.write(master, b"q")
+    ends = {"master": master, "slave": slave}
+    yield ends
+    for end in ends.values():
+        os.close(end)
+
+
+def test_the_stop_key(rig, model_file, tmp_path, terminal):
+    with running(rig, model_file, tmp_path, terminal=terminal["slave"]) as runtime:
+        os.write(terminal["master"], b"q")
         assert_vented(runtime, 79)
         assert "stop key" in runtime.said()
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.wait()
-        os.close(master)
-        os.close(slave)
+
+
+def test_the_terminal_is_closed(rig, model_file, tmp_path, terminal):
+    """Nobody can be told any more; the valves are vented and the log is closed all the same."""
+    with running(rig, model_file, tmp_path, terminal=terminal["slave"], said=terminal["slave"]) as runtime:
+        os.close(terminal.pop("slave"))
+        os.close(terminal.pop("master"))
+        assert runtime.left() == 129
+        assert max(rig.board.duties()) == 0.0
+        assert (runtime.log().meta["exit_code"], runtime.log().meta["vented"]) == (129, True)
 
 
 @pytest.mark.parametrize(

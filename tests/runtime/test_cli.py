@@ -171,3 +171,10 @@ def test_usage(wrong):
     done = run("--robot", "pneumatic-3", *wrong)
     assert done.returncode == 2
     assert wrong[0] in done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_the_exit_code_survives_a_standard_error_that_cannot_be_written():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([SCRIPT, "--robot", "cable-4"], stderr=full, stdin=subprocess.DEVNULL, timeout=60)
+    assert done.returncode == 64
