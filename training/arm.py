@@ -76,6 +76,9 @@ class _Loads(elastica.NoForces):
 class Arm:
     """A robot of `modules` modules of one kind (`cable` or `pneumatic`), starting at rest at activation 0.
 
+    kind: a key of `robots.PLANTS`. Activation 0 of a pneumatic arm is its lower pressure, not a vented chamber. A wrong
+    shape, an actuation outside [-1, 1] or pressures on a cable robot raise ValueError.
+
     A pneumatic arm is simulated as a rod in space too, loads and start in the x-z plane: its motion then stays in the
     plane by itself, exactly, because every force out of it is a sum of zeros.
     """
@@ -84,6 +87,8 @@ class Arm:
         self.kind = kind
         self.plant = PLANTS[kind]
         self.modules = modules
+        self._time_s = np.float64(0.0)
+        self._owed_s = 0.0
         self._build()
         self._keep_rest()
 
@@ -185,8 +190,6 @@ class Arm:
         simulator.finalize()
         self._simulator, self._rod = simulator, rod
         self._stepper = elastica.PositionVerlet()
-        self._time_s = np.float64(0.0)
-        self._owed_s = 0.0
 
     def _keep_rest(self) -> None:
         """Lets the arm settle under its weight, then keeps what `reset` puts back."""

@@ -67,7 +67,7 @@ def write(path: str, run: dict[str, Array]) -> None:
     part = Path(f"{path}.part-{os.getpid()}")
     try:
         with part.open("wb") as file:
-            np.savez(file, **run)
+            np.savez(file, allow_pickle=False, **run)
         part.replace(path)
     except OSError as error:
         raise ModelError(f"{path}: cannot be written ({error}); give --out in a folder that can be") from error
