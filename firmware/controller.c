@@ -133,7 +133,6 @@ static void on_arm(struct controller *c, const struct frame *frame, uint32_t now
   c->channels = arm.channels;
   c->last_seq = frame->seq;
   c->set_tick = c->tick;
-  memset(c->disagree_ms, 0, sizeof c->disagree_ms);
   feed_link(c, now_ms);
   send_status(c);
 }

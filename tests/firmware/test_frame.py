@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modsoft.runtime import protocol
+from modsoft.runtime import cobs, protocol
 
 KINDS = {"flipped bits": 0, "dropped bytes": 1, "inserted bytes": 2, "truncated": 3, "garbage": 4}
 
@@ -32,6 +32,26 @@ def test_damaged_frames_move_no_valve(running, kind):
     result = FuzzResult()
     running.library.fuzz_board(running.handle, ctypes.c_uint64(5), KINDS[kind], 20_000, ctypes.byref(result))
     assert (result.sent, result.wrong, result.lost_after) == (20_000, 0, 0)
+
+
+@pytest.mark.parametrize(("length", "accepted"), [(protocol.MAX_DECODED, True), (protocol.MAX_DECODED + 1, False)])
+def test_longest_frame(board, length, accepted):
+    """The longest is answered (there is no such message), a longer one is dropped whole, and the next is heard."""
+    body = bytes((0x7F, 5, 0)) + bytes(range(1, length - 6))
+    board.messages()
+    board.feed(b"\0" + cobs.cobs_encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0")
+    answers = [frame.message for frame in board.messages()]
+    assert answers == ([protocol.Nack(0x7F, 5, protocol.NackReason.TYPE)] if accepted else [])
+    assert board.library.board_rx_bad(board.handle) == (not accepted)
+    assert isinstance(board.tell(protocol.HelloReq(protocol.PROTOCOL_HASH))[0], protocol.Hello)
+
+
+def test_endless_frame_does_no_harm(board):
+    board.messages()
+    board.feed(b"\xff" * 10_000 + b"\0")
+    board.feed((b"\x02\x55" * 10_000) + b"\0")
+    assert board.library.board_rx_bad(board.handle) == 2
+    assert isinstance(board.tell(protocol.HelloReq(protocol.PROTOCOL_HASH))[0], protocol.Hello)
 
 
 def test_crc_is_zlibs(sanitised):
