@@ -18,14 +18,13 @@ from modsoft.runtime.errors import UsageError
 @click.option("--out", default="model.pt", type=click.Path(path_type=Path, dir_okay=False), help="Model to make.")
 @click.option("--iterations", default=6000, type=click.IntRange(1), help="Steps of the optimiser.")
 @click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Time that ends the run if it is first.")
-@click.option("--batch", default=64, type=click.IntRange(1), help="Windows in a step.")
+@click.option("--batch", type=click.IntRange(1), help="Windows in a step.  [default: 64 cable, 128 pneumatic]")
 @click.option("--rate", default=3e-3, type=click.FloatRange(min=0, min_open=True), help="Peak learning rate.")
 @click.option("--dropout", default=0.05, type=click.FloatRange(0, 1, max_open=True), help="Between the layers.")
 @click.option(
     "--shorter",
-    default=0.0,
     type=click.FloatRange(0, 1),
-    help="Share of the steps that take the robot's last modules for a shorter robot.",
+    help="Share of the steps that take the last modules for a shorter robot.  [default: 0 cable, 0.4 pneumatic]",
 )
 @click.option("--history", type=click.IntRange(1), help="Time steps T.  [default: 5 cable, 10 pneumatic]")
 @click.option(
@@ -36,7 +35,7 @@ from modsoft.runtime.errors import UsageError
 )
 @click.option("--seed", default=0, type=click.IntRange(0), help="The same seed gives the same model.")
 @click.option("--threads", default=1, type=click.IntRange(1), help="Cores; more than are free is far slower than one.")
-def cli(data_file: Path, out: Path, history: int | None, **options: Any) -> None:
+def cli(data_file: Path, out: Path, **options: Any) -> None:
     """Train the bidirectional LSTM of the paper's Table S1 on a DATASET of modsoft-collect.
 
     \b
@@ -55,7 +54,8 @@ def cli(data_file: Path, out: Path, history: int | None, **options: Any) -> None
     from modsoft.training import dataset, train
 
     data = dataset.read(data_file)
-    settings = train.Settings(history=history or train.HISTORY[data.robot.robot.kind], **options)
+    told = {name: value for name, value in options.items() if value is not None}
+    settings = train.Settings(**{**train.BY_KIND[data.robot.robot.kind], **told})
     began_s, first, smooth = time.monotonic(), None, 0.0
     with tqdm(
         total=100, desc="train", bar_format="{desc}: {percentage:3.0f}%|{bar}| {remaining} left, {postfix}"
@@ -66,7 +66,7 @@ def cli(data_file: Path, out: Path, history: int | None, **options: Any) -> None
             if first is None:  # what an earlier run did does not count into the rate
                 first, smooth = told.iteration - 1, told.loss
             smooth = 0.98 * smooth + 0.02 * told.loss
-            rate = (told.iteration - first) * options["batch"] / (time.monotonic() - began_s)
+            rate = (told.iteration - first) * settings.batch / (time.monotonic() - began_s)
             best = f"{told.validation_percent:.2f} %"
             bar.set_postfix_str(f"{rate:.0f} samples/s, loss {smooth:.5f}, best validation {best}", refresh=False)
             bar.update(100 * told.share - bar.n)

@@ -40,6 +40,8 @@ def test_killed_and_started_again_it_ends_with_the_same_model(folder):
     straight = run(folder, "d.h5", "--out", "straight.pt", *QUICK)
     assert straight.returncode == 0, straight.stderr
     assert "module 2: actuation estimated within" in straight.stdout
+    said = checkpoints.load(folder / "straight.pt")["provenance"]
+    assert (said["history"], said["batch"], said["shorter"], said["split"]) == (3, 8, 0.4, "blocks")
     victim = subprocess.Popen(command(folder, "d.h5", "--out", "m.pt", *QUICK), cwd=folder, stderr=subprocess.DEVNULL)
     resume = folder / "m.pt.resume"
     patience = time.monotonic() + 60
