@@ -326,6 +326,14 @@ def test_garbage_and_damaged_frames_do_not_feed_the_link(running):
     assert isinstance(running.tell(HelloReq(protocol.PROTOCOL_HASH))[0], Hello)
 
 
+def test_heartbeats_of_an_old_session_are_no_sign_of_life(running):
+    for _ in range(31):
+        running.tick += 1
+        running.tell(protocol.Heartbeat(running.tick), session=0)
+        running.wait(10)
+    assert running.faults == Fault.LINK_TIMEOUT
+
+
 def test_stuck_control_loop_vents(running):
     running.set(3500)
     started = running.now_ms
