@@ -35,7 +35,7 @@ def closed_loop(robot: Robot, arm: Any, actuate: Actuate, history: int, desired:
         raw = actuate(window.features(state_of(target, kind)))
         previous = actions[k] = limited(raw, previous, robot.limits.largest_actuation_step)
         window.applied(actions[k])
-        arm.step(actions[k])
+        arm.step(actions[k], robot.loop.period_s)
         configuration.append(arm.configuration)
     return np.stack(configuration), actions
 
