@@ -306,6 +306,16 @@ def test_a_step_that_takes_too_long_is_not_sent_and_the_next_is_in_time():
     assert world.beats == [4]
     assert world.tally.missed == 1
     assert 3 not in [tick - 1 for _, tick, _ in world.sent]
+    # the history of the next step knows what was applied, not what was meant
+    assert world.features[4].reshape(3, -1)[0, 8] == world.ticks[2]["actuation"][0, 0]
+
+
+def test_missed_ticks_that_are_apart_do_not_add_up():
+    world = World(steps=30)
+    for step in (3, 8, 13, 18, 23):
+        world.at[step] = lambda: setattr(world, "time_s", world.time_s + 1.3 * PERIOD_S)
+    world.run()
+    assert world.tally.missed == 5
 
 
 def test_skipped_ticks_go_into_the_history_as_held():
