@@ -225,13 +225,15 @@ class Board:
                 self._link.vent(mode)
         if self._link.phase is Phase.READY:
             self._wait(lambda: self._said_vented(since), self._clock() + timeout_s)
-        if self._link.phase is Phase.LOST and not self._listened:
-            self._listened = True  # once: nothing more will come after that
-            self._wait(lambda: self._said_vented(since), self._clock() + LOST_VENT_WAIT_S)
+        if self._link.phase is Phase.LOST:
+            since = self._link.lost_at  # whatever it said from then on still holds: nobody told it to open a valve
+            if not self._listened:
+                self._listened = True  # once: nothing more will come after that
+                self._wait(lambda: self._said_vented(since), self._clock() + LOST_VENT_WAIT_S)
         return self._said_vented(since)
 
     def _said_vented(self, since: float) -> bool:
-        return self._link.vented and self._link.status_at > since and not self._link.busy
+        return self._link.vented and self._link.status_at >= since and not self._link.busy
 
     def clear_fault(self, mask: int | None = None) -> bool:
         """Clear exactly these faults (None: all that are latched); True when the board did. It refuses while a sensor

@@ -76,6 +76,7 @@ class Link:
         self.status: Status | None = None
         self.status_at = now
         self.lost: str | None = None  # why, in words
+        self.lost_at = now
         self.gave_up = False  # nothing announced itself, not even after all resets
         self.dtr = True  # what the port's DTR line should be; its rising edge resets the board
         self.ack_latency_s: float | None = None  # of the last SET, once it is acknowledged in time
