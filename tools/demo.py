@@ -57,7 +57,7 @@ STAGES = [
     ),
     Stage(
         "train the biLSTM controller",
-        ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--minutes", "2.5"],
+        ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--minutes", "3.5"],
         CHECKPOINT,
         [str(DATA)] + [f"training/{name}.py" for name in ("train", "dataset", "networks")],
     ),
