@@ -72,6 +72,7 @@ def flawless():
         board_events=[{"event": "reset", "cause": "external", "mono_ns": START_NS - 3_000_000_000}],
         board_dropped_bytes=0,
         board_late_ms=1.2,
+        board_slipped_percent=0.0,
         board_summary={},
         plant_mono_ns=plant_mono,
         plant_configuration=from_angles_deg(plant_angles),
@@ -196,6 +197,12 @@ def test_a_slow_host_voids_the_timing_and_nothing_else(flawless):
     assert "180 ms" in verdict.reason
     worse = judge(replace(flawless, **slow, faults=changed(flawless.faults, 3, 1)))
     assert worse.word == "failed"
+
+
+def test_many_short_stalls_are_a_slow_host(flawless):
+    verdict = judge(replace(flawless, board_late_ms=30.0, board_slipped_percent=0.6))
+    assert verdict.word == "not judged"
+    assert "stalls" in verdict.reason
 
 
 def test_a_slow_plant_is_a_slow_host(flawless):

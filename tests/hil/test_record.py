@@ -56,6 +56,14 @@ def test_vented_already_is_no_time_at_all():
     assert record.vented_after_ms([READY, pwm(1, 0, 0.1), pwm(2, 0, 0.0)], 5_000_000) == 0.0
 
 
+def test_lateness_is_that_of_the_run():
+    late = [{"event": "late", "late_us": us, "mono_ns": ns} for us, ns in ((90e3, 0), (30e3, 2e9), (25e3, 3e9))]
+    found = record._board_lateness(late, {"max_late_us": 90e3}, start_ns=1e9, end_ns=int(11e9))
+    assert found == {"board_late_ms": 30.0, "board_slipped_percent": pytest.approx(0.55)}
+    assert record._board_lateness([], {"max_late_us": 7e3}, 1e9, int(11e9))["board_late_ms"] == 7.0
+    assert math.isnan(record._board_lateness([], {}, 1e9, int(11e9))["board_late_ms"])
+
+
 def test_a_line_cut_by_a_kill_is_left_out(tmp_path):
     (tmp_path / "x.jsonl").write_text(json.dumps({"tick": 0}) + "\n" + '{"tick": 1, "con')
     assert record.lines(tmp_path / "x.jsonl") == [{"tick": 0}]

@@ -41,6 +41,7 @@ def record():
         board_events=[],
         board_dropped_bytes=0,
         board_late_ms=0.4,
+        board_slipped_percent=0.0,
         board_summary={},
         plant_mono_ns=np.arange(slices) * 20_000_000,
         plant_configuration=np.repeat(from_angles_deg(angles + np.array([0.5, -2.0])), 20, axis=0),

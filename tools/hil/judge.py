@@ -38,10 +38,12 @@ TRACKING_DEG: dict[tuple[str, int], list[float]] = {
     ("down", 2): [2.0, 3.5],
     ("edge", 2): [1.5, 5.0],
 }
-# The witnesses that the host kept up. Beyond these the timing says more about the host than about the software: the
-# board's shortest time-out is 300 ms, the control period 400 ms.
-BOARD_LATE_MS = 50.0
-PLANT_LATE_MS = 50.0
+# The witnesses that the host kept up. Beyond these the timing says more about the host than about the software. A stall
+# of the board lengthens the acknowledgements that are judged and spares its own time-outs: one heartbeat of it (100 ms;
+# the shortest time-out is 300 ms) hides nothing. The plant catches up; a quarter of a control period is still in time.
+BOARD_LATE_MS = 100.0
+BOARD_SLIPPED_PERCENT = 0.5  # of the run, in stalls
+PLANT_LATE_MS = 100.0
 SETTLING_S = 0.03  # after acknowledgement and slew: some loops of the firmware; the board's lateness comes on top
 
 
@@ -87,6 +89,7 @@ class Record:
     board_events: list[dict[str, Any]]  # resets and watchdog, all of the emulator's life
     board_dropped_bytes: float  # by the board's receiver; NaN where it did not say
     board_late_ms: float  # largest lateness of emulated time in the run
+    board_slipped_percent: float  # of the run, where emulated time gave way
     board_summary: dict[str, Any]
     plant_mono_ns: NDArray[np.int64]  # (M,)
     plant_configuration: Array  # (M, N, 3)
@@ -243,6 +246,7 @@ def witnesses(record: Record) -> list[Acceptance]:
     plant_ms = float(np.max(record.plant_late_ms)) if len(record.plant_late_ms) else math.nan
     return [
         at_most("emulated board behind real time, at most", record.board_late_ms, BOARD_LATE_MS, " ms"),
+        at_most("run lost to stalls of the board", record.board_slipped_percent, BOARD_SLIPPED_PERCENT, " %"),
         at_most("simulated robot behind real time, at most", plant_ms, PLANT_LATE_MS, " ms"),
     ]
 

@@ -59,7 +59,7 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, steps: int, ru
         valves=valves(events),
         board_events=[event for event in events if event["event"] in ("reset", "watchdog")],
         board_dropped_bytes=summary.get("rx_overrun", math.nan),
-        board_late_ms=_board_late_ms(events, summary, start_ns, end_ns),
+        **_board_lateness(events, summary, start_ns, end_ns),
         board_summary=summary,
         **_plant(plant, modules, start_ns, end_ns),
     )
@@ -81,13 +81,17 @@ def _commanded(ticks: list[Line]) -> np.ndarray:
     return np.array(rows, dtype=np.float64).reshape(len(ticks), -1 if rows else 0)
 
 
-def _board_late_ms(events: list[Line], summary: Line, start_ns: float, end_ns: int) -> float:
-    """Largest lateness of the emulated board in the run, NaN where it gave no summary. It says `late` whenever the
-    bound is passed; without that it was within the bound, or within its largest lateness ever."""
+def _board_lateness(events: list[Line], summary: Line, start_ns: float, end_ns: int) -> Line:
+    """Lateness of the emulated board in the run, NaN where it gave no summary. It says `late` whenever the bound is
+    passed and emulated time gives way; without that it was within the bound, or within its largest lateness ever."""
     late = [event["late_us"] * 1e-3 for event in events if event["event"] == "late"
             and start_ns <= event["mono_ns"] <= end_ns]  # fmt: skip
     ever_ms = summary.get("max_late_us", math.nan) * 1e-3
-    return max(late) if late else min(LATE_BOUND_MS, ever_ms) if ever_ms >= 0 else math.nan
+    run_ms = (end_ns - start_ns) * 1e-6
+    return {
+        "board_late_ms": max(late) if late else min(LATE_BOUND_MS, ever_ms) if ever_ms >= 0 else math.nan,
+        "board_slipped_percent": 100.0 * sum(late) / run_ms if run_ms > 0 else math.nan,
+    }
 
 
 def _plant(states: list[Line], modules: int, start_ns: float, end_ns: int) -> Line:
