@@ -64,8 +64,11 @@ def draw_actions(robot: Robot, strategy: str, steps: int, rng: np.random.Generat
 
 
 def _paces(shape: tuple[int, int, int], rng: np.random.Generator) -> Array:
-    """Share of the largest step in (0, 1] that each walk (steps, N, A) keeps to; changes every 20 steps on average."""
-    paces = rng.uniform(0.0, 1.0, shape)
+    """Share of the largest step in (0, 1] that each walk (steps, N, A) keeps to; changes every 20 steps on average.
+
+    Cubed, so that half of them are below an eighth: tasks move slowly, and friction shows when a robot does.
+    """
+    paces = rng.uniform(0.0, 1.0, shape) ** 3
     for step, changes in enumerate(rng.uniform(size=shape) < 0.05):
         if step > 0:
             paces[step] = np.where(changes, paces[step], paces[step - 1])

@@ -84,19 +84,41 @@ def test_the_loop_would_send_every_drawn_action_as_it_is(modules, largest, strat
         previous = action
 
 
-@pytest.mark.parametrize("largest", [0.4, 2.0])
-def test_actions_are_uniform_to_the_ends_of_the_range(largest):
-    robot = of_modules("cable", 2, largest)
-    drawn = np.concatenate([draw(robot, "random", 2000, seed)[100:].ravel() for seed in range(20)])
-    found, _ = np.histogram(drawn, bins=10, range=(-1, 1))
-    np.testing.assert_allclose(found / len(drawn), 0.1, atol=0.012)
+def shares(values: np.ndarray) -> np.ndarray:
+    """Of each tenth of the range."""
+    found, _ = np.histogram(values, bins=10, range=(-1, 1))
+    return found / values.size
+
+
+def test_unbounded_actions_are_uniform():
+    drawn = draw(of_modules("cable", 2), "random", 20000)
+    np.testing.assert_allclose(shares(drawn), 0.1, atol=0.01)
+
+
+@given(st.floats(0.01, 1.9))
+def test_a_reflected_walk_keeps_a_uniform_distribution_whatever_its_step(largest):
+    rng = np.random.default_rng(0)
+    increments = rng.uniform(-largest, largest, (5, 20000))
+    increments[0] = rng.uniform(-1, 1, 20000)  # walkers all over the range
+    for places in c._reflected_walk(increments):
+        np.testing.assert_allclose(shares(places), 0.1, atol=0.01)
+
+
+def test_bounded_actions_cover_the_range_in_a_data_set_of_the_usual_size():
+    robot = of_modules("pneumatic", 3, 0.4)
+    drawn = np.stack([draw(robot, "staged", 300, seed) for seed in range(50)])
+    for module in range(3):
+        found = shares(drawn[:, :, module])
+        assert found.min() > 0.04  # the ends of the range; 0.059 was seen
+        assert found.max() < 0.2  # around rest, where every episode begins; 0.171 was seen
 
 
 def test_random_actions_differ_between_modules_and_change_slowly_and_fast():
     actions = draw(of_modules("cable", 3, 0.4), "random", 2000)
     steps = np.abs(np.diff(actions, axis=0))
-    assert np.mean(steps < 0.02) > 0.05
-    assert np.mean(steps > 0.3) > 0.02
+    assert np.mean(steps < 0.02) > 0.4
+    assert np.mean((steps > 0.02) & (steps < 0.1)) > 0.1
+    assert np.mean(steps > 0.2) > 0.02
     assert not np.any(actions[:, 0] == actions[:, 1])
 
 
@@ -121,7 +143,8 @@ def test_a_data_set_carries_its_recipe_and_reads_back(tmp_path):
     assert list(tmp_path.iterdir()) == [out]
     data = dataset.read(out)
     assert data.robot == robot
-    assert data.sha256() == made.sha256()
+    assert made == dataset.Header(data.recipe, made.stage_borders, 0, 4)
+    assert made.samples == data.samples == 120
     assert data.configuration.shape == (4, 31, 3, 3)
     assert data.action.shape == (4, 30, 3, 1)
     assert list(data.stage_borders) == [0, 10, 20, 30]
@@ -145,7 +168,8 @@ def test_an_episode_that_is_not_finite_is_drawn_again_and_counted(tmp_path, toge
             lost.append(actions[i])
         return configuration
 
-    data = c.collect(robot, tmp_path / "d.h5", 120, "random", 0, 10, plant=plant(sometimes_lost, together))
+    c.collect(robot, tmp_path / "d.h5", 120, "random", 0, 10, plant=plant(sometimes_lost, together))
+    data = dataset.read(tmp_path / "d.h5")
     assert data.redrawn == len(lost) > 2
     assert np.all(data.action[:, 0, 0, 0] <= 0.5)
     np.testing.assert_array_equal(data.configuration, simulate(robot, data.action))
@@ -194,12 +218,26 @@ def test_another_recipe_is_refused_and_nothing_is_touched(tmp_path, change, mess
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
 
-def test_a_damaged_episode_is_made_again(tmp_path):
+def cut(shard: Path) -> None:
+    shard.write_bytes(shard.read_bytes()[:-200])
+
+
+def poison(shard: Path) -> None:
+    """Plants a value that is not finite."""
+    with np.load(shard) as file:
+        arrays = dict(file)
+    arrays["configuration"][7, 1, 2] = np.inf
+    np.savez(shard, **arrays)
+
+
+@pytest.mark.parametrize("damage", [cut, poison])
+def test_a_damaged_episode_is_made_again(tmp_path, damage):
     out = parts_of_one_episode(tmp_path)
     shard = out.with_name("d.h5.parts") / "episode-000000.npz"
-    shard.write_bytes(shard.read_bytes()[:-200])
+    damage(shard)
     robot = of_modules("pneumatic", 3, 0.4)
-    data = c.collect(robot, out, 60, "staged", 1, 30, plant=plant())
+    c.collect(robot, out, 60, "staged", 1, 30, plant=plant())
+    data = dataset.read(out)
     np.testing.assert_array_equal(data.action[0], c.episodes(data.recipe, robot, [0], simulate)[0][1])
 
 
@@ -215,6 +253,28 @@ def test_a_finished_data_set_is_not_made_again(tmp_path):
     assert out.stat().st_mtime_ns == written
     with pytest.raises(ModelError, match="2 episodes of 10 steps, asked for 3"):
         c.collect(robot, out, 30, "random", 0, 10, plant=plant(never))
+
+
+@pytest.mark.parametrize("kept", ["d.h5.parts", ".d.h5.parts.host.12.tmp"])
+def test_what_a_kill_at_the_very_end_left_is_cleared_away(tmp_path, kept):
+    out = parts_of_one_episode(tmp_path)
+    robot = of_modules("pneumatic", 3, 0.4)
+    c.collect(robot, out, 60, "staged", 1, 30, plant=plant())
+    (tmp_path / kept).mkdir()
+    (tmp_path / kept / "episode-000000.npz").touch()
+    (tmp_path / ".d.h5.12.tmp").touch()
+    c.collect(robot, out, 60, "staged", 1, 30, plant=plant())
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_an_episode_that_is_not_finite_does_not_pass_the_last_door(tmp_path):
+    good = c.episodes(
+        c.recipe_of(of_modules("pneumatic", 2), "random", 0, 10, "p"), of_modules("pneumatic", 2), [0], simulate
+    )
+    bad = good[0]._replace(configuration=np.full_like(good[0].configuration, np.nan))
+    with pytest.raises(ModelError, match="episode 1 is not finite"):
+        dataset.join(tmp_path / "d.h5", {}, np.array([0, 10]), 2, iter([*good, bad]))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_is_not_there_is_a_usage_error(tmp_path):
