@@ -1,31 +1,34 @@
 """Collecting data: random actions on a simulated robot (section 2.2 of the paper), restartable after a kill.
 
-An episode starts from rest and is a pure function of (robot, strategy, seed, steps, index). Finished episodes lie in
-`OUT.parts/`, each under its final name only when whole; at the end they are joined to one HDF5 file.
+An episode starts from rest and is a pure function of (robot, strategy, seed, steps, index): whoever makes it, with
+whatever beside it, gets the same numbers. Finished episodes lie in `OUT.parts/` and are joined to one HDF5 file at the
+end, one after the other, so that memory does not grow with their number.
 """
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import itertools
 import json
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.robot import Robot
-from modsoft.training import dataset, plants, workers
+from modsoft.training import dataset, plants
+from modsoft.training.backends import BACKENDS
+from modsoft.training.dataset import Episode
 from modsoft.training.plants import Plant, Simulate
 from modsoft.training.robots import PLANTS
+from modsoft.training.shards import Shards, refuse_other
 
 STRATEGIES = ("staged", "random")
 MOST_ATTEMPTS = 10  # a robot that is not finite so often in a row is broken, not unlucky
@@ -81,12 +84,9 @@ def _reflected_walk(increments: Array) -> Array:
     return 1.0 - np.abs(unfolded % 4.0 - 2.0)
 
 
-def episodes(
-    recipe: dict[str, Any], robot: Robot, indices: list[int], simulate: Simulate
-) -> list[tuple[Array, Array, int]]:
-    """For each index: configurations (K + 1, N, 3), actions (K, N, A), and how often it had to be drawn again, for an
-    episode that is not finite is never kept."""
-    made: dict[int, tuple[Array, Array, int]] = {}
+def episodes(recipe: dict[str, Any], robot: Robot, indices: list[int], simulate: Simulate) -> list[Episode]:
+    """The episode of each index. One that is not finite is never kept: the robot is drawn again, and it is counted."""
+    made: dict[int, Episode] = {}
     for attempt in range(MOST_ATTEMPTS):
         left = [index for index in indices if index not in made]
         if not left:
@@ -96,8 +96,9 @@ def episodes(
             [draw_actions(robot, recipe["strategy"], recipe["steps"], np.random.default_rng(seed)) for seed in seeds]
         )
         for index, configuration, action in zip(left, simulate(robot, actions), actions, strict=True):
-            if np.all(np.isfinite(configuration)):
-                made[index] = (configuration, action, attempt)
+            episode = Episode(configuration, action, attempt)
+            if episode.is_finite():
+                made[index] = episode
     lost = [index for index in indices if index not in made]
     if lost:
         raise ModelError(
@@ -133,107 +134,76 @@ def collect(
     jobs: int = 1,
     plant: Plant | None = None,
     progress: Callable[[int, int], None] = lambda done, samples: None,
-) -> dataset.DataSet:
+    backend: str = "local",
+    options: dict[str, Any] | None = None,
+) -> dataset.Header:
     """Makes the data set `out`: at least `samples` control steps in episodes of `steps`.
 
     What `out` or `out.parts` holds already of the same recipe is kept; of another recipe it is refused. `progress` is
-    told the samples done and the samples in all. jobs = 1 works in this process, more in as many others. plant: the
-    fastest there is by default.
+    told the samples done and the samples in all. plant: the fastest there is by default. backend, jobs, options: who
+    does the work, see `backends.BACKENDS`; none of them changes a number.
     """
     if plant is None:
         plant = plants.fastest(robot)
     count = -(-samples // steps)
     recipe = recipe_of(robot, strategy, seed, steps, plant.name)
-    if out.exists():
-        return _finished(out, recipe, count)
+    out = out.absolute()  # workers may stand in another folder
+    shards = Shards(out.with_name(f"{out.name}.parts"))
     if not out.parent.is_dir():
         raise UsageError(f"no folder {out.parent} for the data set {out.name}; make it first")
-    parts = out.with_name(f"{out.name}.parts")
-    _open_parts(parts, recipe)
-    missing = [index for index in range(count) if not _is_whole(parts, index, recipe, robot)]
-    done = count - len(missing)
-    progress(done * steps, count * steps)
-    # Work is told by index alone: any process makes the same episode of it, whatever it is made together with.
-    bundles = [missing[i : i + plant.together] for i in range(0, len(missing), plant.together)]
-    for bundle in workers.run(_Task(recipe, robot, parts, plant.simulate), bundles, jobs):
-        done += len(bundle)
-        progress(done * steps, count * steps)
+    _sweep(out)
+    if out.exists():
+        header = _finished(out, recipe, count)
+        shards.remove()  # killed between the last two lines below
+        return header
+    shards.open(recipe)
+    shards.drop_damaged((steps + 1, robot.modules, 3))
+    wanted = set(range(count))
 
-    shards = [_read_shard(parts, index) for index in range(count)]
-    data = dataset.DataSet(
-        recipe=recipe,
-        configuration=np.stack([shard["configuration"] for shard in shards]),
-        action=np.stack([shard["action"] for shard in shards]),
-        stage_borders=stage_borders(strategy, robot.modules, steps),
-        redrawn=int(sum(shard["redrawn"] for shard in shards)),
-    )
-    dataset.write(data, out)
-    shutil.rmtree(parts)
-    return data
+    def tell() -> None:
+        progress(len(wanted & shards.finished()) * steps, count * steps)
+
+    tell()
+    missing = sorted(wanted - shards.finished())
+    bundles = [missing[i : i + plant.together] for i in range(0, len(missing), plant.together)]
+    task = _Task(recipe, robot, shards, plant.simulate)
+    for _ in BACKENDS[backend](task, bundles, jobs, shards.folder, options or {}):
+        tell()
+
+    joined = (shards.read(index) for index in range(count))
+    header = dataset.join(out, recipe, stage_borders(strategy, robot.modules, steps), count, joined)
+    shards.remove()
+    return header
 
 
 class _Task:
-    """Makes a bundle of episodes and stores each; goes to the worker processes whole."""
+    """Makes a bundle of episodes and stores each; goes to the workers whole."""
 
-    def __init__(self, recipe: dict[str, Any], robot: Robot, parts: Path, simulate: Simulate):
-        self.recipe, self.robot, self.parts, self.simulate = recipe, robot, parts, simulate
+    def __init__(self, recipe: dict[str, Any], robot: Robot, shards: Shards, simulate: Simulate):
+        self.recipe, self.robot, self.shards, self.simulate = recipe, robot, shards, simulate
 
     def __call__(self, bundle: list[int]) -> None:
-        made = episodes(self.recipe, self.robot, bundle, self.simulate)
-        for index, (configuration, action, redrawn) in zip(bundle, made, strict=True):
-            temporary = self.parts / f".{index}.{os.getpid()}.tmp"
-            with temporary.open("wb") as file:
-                np.savez(file, configuration=configuration, action=action, redrawn=redrawn)
-            os.replace(temporary, _shard(self.parts, index))
+        finished = self.shards.finished()  # by a worker that was lost before it could say so
+        left = [index for index in bundle if index not in finished]
+        for index, episode in zip(left, episodes(self.recipe, self.robot, left, self.simulate), strict=True):
+            self.shards.write(index, episode)
 
 
-def _shard(parts: Path, index: int) -> Path:
-    return parts / f"episode-{index:06}.npz"
+def _sweep(out: Path) -> None:
+    """Removes what a collection left beside `out` that was killed while it joined or cleared away."""
+    for stale in out.parent.glob(f".{glob.escape(out.name)}.*.tmp"):
+        if stale.is_dir():
+            shutil.rmtree(stale, ignore_errors=True)
+        else:
+            stale.unlink(missing_ok=True)
 
 
-def _read_shard(parts: Path, index: int) -> dict[str, Any]:
-    with np.load(_shard(parts, index), allow_pickle=False) as file:
-        return {name: file[name] for name in ("configuration", "action", "redrawn")}
-
-
-def _is_whole(parts: Path, index: int, recipe: dict[str, Any], robot: Robot) -> bool:
-    """Whether the episode is there and readable; one damaged on the disk is made again."""
-    try:
-        shard = _read_shard(parts, index)
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-        return False
-    return shard["configuration"].shape == (recipe["steps"] + 1, robot.modules, 3)
-
-
-def _open_parts(parts: Path, recipe: dict[str, Any]) -> None:
-    """Makes the folder, or checks that the one there belongs to the same recipe."""
-    told = parts / "recipe.json"
-    parts.mkdir(exist_ok=True)
-    for stale in parts.glob(".*.tmp"):  # of a process that was killed while it wrote
-        stale.unlink(missing_ok=True)
-    if told.is_file():
-        _refuse_other(json.loads(told.read_text(encoding="utf-8")), recipe, parts)
-        return
-    temporary = parts / f".recipe.{os.getpid()}.tmp"
-    temporary.write_text(json.dumps(recipe, indent=1), encoding="utf-8")
-    os.replace(temporary, told)
-
-
-def _finished(out: Path, recipe: dict[str, Any], episodes: int) -> dataset.DataSet:
-    data = dataset.read(out)
-    _refuse_other(data.recipe, recipe, out)
-    if len(data.action) != episodes:
+def _finished(out: Path, recipe: dict[str, Any], episodes: int) -> dataset.Header:
+    header = dataset.read_header(out)
+    refuse_other(header.recipe, recipe, out)
+    if header.episodes != episodes:
         raise ModelError(
-            f"{out}: there already with {len(data.action)} episodes of {recipe['steps']} steps, asked for {episodes}; "
+            f"{out}: there already with {header.episodes} episodes of {recipe['steps']} steps, asked for {episodes}; "
             "give another --out, or delete it"
         )
-    return data
-
-
-def _refuse_other(found: dict[str, Any], recipe: dict[str, Any], where: Path) -> None:
-    differences = [key for key in recipe if found.get(key) != recipe[key]]
-    if differences:
-        key = differences[0]
-        is_short = not isinstance(recipe[key], dict)
-        what = f"{key} {found.get(key)}, asked for {recipe[key]}" if is_short else f"another {key}"
-        raise ModelError(f"{where}: begun with {what}; give another --out, or delete it")
+    return header

@@ -1,9 +1,10 @@
-"""`modsoft-collect`: a data set from the simulated robot."""
+"""`modsoft-collect`: a data set from the simulated robot, and pictures of what data sets cover."""
 
 from __future__ import annotations
 
-import os
+import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -11,9 +12,14 @@ from modsoft.runtime import robot as robots
 from modsoft.runtime.command import entry
 
 
-@click.command("modsoft-collect", context_settings={"show_default": True})
-@click.option("--robot", "robot_file", required=True, help="Robot file, or a shipped robot's name (pneumatic-3, ...).")
-@click.option("--out", required=True, type=click.Path(path_type=Path, dir_okay=False), help="Data set to make (HDF5).")
+@click.group(
+    "modsoft-collect",
+    context_settings={"show_default": True},
+    invoke_without_command=True,
+    subcommand_metavar="[plot DATASET... --out FILE.png]",
+)
+@click.option("--robot", "robot_file", help="Robot file, or a shipped robot's name (pneumatic-3, ...).  [required]")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Data set to make (HDF5).  [required]")
 @click.option("--samples", default=15000, type=click.IntRange(1), help="Control steps at least, in all.")
 @click.option(
     "--strategy",
@@ -23,8 +29,36 @@ from modsoft.runtime.command import entry
 )
 @click.option("--seed", default=0, type=click.IntRange(0), help="The same seed gives the same data set.")
 @click.option("--steps", default=300, type=click.IntRange(1), help="Control steps of an episode; each starts at rest.")
-@click.option("--jobs", default=os.cpu_count() or 1, type=click.IntRange(1), help="Processes, a core each.")
-def cli(robot_file: str, out: Path, samples: int, strategy: str, seed: int, steps: int, jobs: int) -> None:
+@click.option("--jobs", type=click.IntRange(1), help="Processes, cluster jobs or workers at a time.  [default: cores]")
+@click.option(
+    "--backend",
+    default="local",
+    type=click.Choice(["local", "submitit", "dask"]),
+    help="local: processes here. submitit: SLURM jobs (extra slurm). dask: its workers (extra dask).",
+)
+@click.option(
+    "--backend-option",
+    "options",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="For submitit: slurm_partition=long, timeout_min=60, ... For dask: scheduler=ADDRESS, or cluster=SLURMCluster "
+    "and its parameters (cores=1, memory=2GB, ...). May be repeated.",
+)
+@click.option("--plant", help="Simulator: elastica, fleet-plain, fleet-avx2, ...  [default: the fastest here]")
+@click.pass_context
+def cli(
+    context: click.Context,
+    robot_file: str | None,
+    out: Path | None,
+    samples: int,
+    strategy: str,
+    seed: int,
+    steps: int,
+    jobs: int | None,
+    backend: str,
+    options: tuple[str, ...],
+    plant: str | None,
+) -> None:
     """Drive the simulated robot with random actions and record what it does.
 
     \b
@@ -32,16 +66,23 @@ def cli(robot_file: str, out: Path, samples: int, strategy: str, seed: int, step
       modsoft-collect --robot pneumatic-3 --samples 15000 --out dataset.h5
 
     Stopped or killed, the same command goes on where it was: whole episodes wait in OUT.parts, and the finished file
-    is the same, bit for bit, as if nothing had happened.
+    is the same, bit for bit, as if nothing had happened. Neither --jobs nor --backend changes a number. On a cluster
+    every worker needs the same installation and the folder of OUT.
     """
+    if context.invoked_subcommand is not None:
+        return
+    if robot_file is None or out is None:
+        raise click.UsageError(f"missing option {'--out' if robot_file else '--robot'}; see --help", context)
     robot = robots.load(robot_file)
+    given = dict(_option(text) for text in options)
     from tqdm import tqdm
 
     from modsoft.training import plants
+    from modsoft.training.backends import cores
     from modsoft.training.collect import collect
 
-    plant = plants.fastest(robot)
-    if plant.name == "elastica":
+    chosen = plants.fastest(robot) if plant is None else plants.named(plant, robot)
+    if plant is None and chosen.name == "elastica":
         click.echo("the fast plant is not built (no C compiler at installation?): PyElastica, slower", err=True)
     bar: tqdm | None = None
 
@@ -52,12 +93,43 @@ def cli(robot_file: str, out: Path, samples: int, strategy: str, seed: int, step
         bar.update(done - bar.n)
 
     try:
-        data = collect(robot, out, samples, strategy, seed, steps, jobs, plant, progress)
+        made = collect(
+            robot, out, samples, strategy, seed, steps, jobs or cores(), chosen, progress, backend, given
+        )  # fmt: skip
     finally:
         if bar is not None:
             bar.close()
-    again = f", {data.redrawn} of them drawn again" if data.redrawn else ""
-    click.echo(f"{out}: {data.samples} samples in {len(data.action)} episodes{again}")
+    lost = f"; {made.redrawn} robots went non-finite, were dropped and drawn again" if made.redrawn else ""
+    click.echo(f"{out}: {made.samples} samples in {made.episodes} episodes{lost}")
+
+
+def _option(text: str) -> tuple[str, Any]:
+    """NAME=VALUE; a value that is JSON (a number, a list) is taken as such, any other as text."""
+    name, separator, value = text.partition("=")
+    if not (name and separator):
+        raise click.UsageError(f"--backend-option {text}: expected NAME=VALUE")
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value
+
+
+@cli.command()
+@click.argument("data_files", metavar="DATASET...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=click.Path(path_type=Path, dir_okay=False), help="Picture (PNG, PDF, SVG).")
+def plot(data_files: tuple[Path, ...], out: Path) -> None:
+    """Show where the module ends of data sets were, side by side, and how much space they cover.
+
+    \b
+    Example:
+      modsoft-collect plot staged.h5 random.h5 --out workspace.png
+    """
+    from modsoft.training import coverage
+
+    found = coverage.compare(list(data_files))
+    coverage.draw(found, out)
+    for each in found:
+        click.echo(coverage.line(each))
 
 
 main = entry(cli)

@@ -10,11 +10,14 @@ Attributes: `RECIPE` (JSON; all that the numbers depend on), `stage_borders` (N 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -59,24 +62,68 @@ class DataSet:
         return digest.hexdigest()
 
 
+class Episode(NamedTuple):
+    """One run of the robot from rest."""
+
+    configuration: Array  # (K + 1, N, 3)
+    action: Array  # (K, N, A)
+    redrawn: int = 0  # how often it had been drawn before without staying finite
+
+    def is_finite(self) -> bool:
+        return bool(np.isfinite(self.configuration).all() and np.isfinite(self.action).all())
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a data set says about itself without its numbers."""
+
+    recipe: dict[str, Any]
+    stage_borders: NDArray[np.int64]
+    redrawn: int
+    episodes: int
+
+    @property
+    def samples(self) -> int:
+        """Control steps in all episodes."""
+        return self.episodes * int(self.stage_borders[-1])
+
+
 def write(data: DataSet, path: Path) -> None:
     """Writes beside `path` and renames. The same data give the same bytes."""
+    redrawn = itertools.chain([data.redrawn], itertools.repeat(0))
+    episodes = map(Episode, data.configuration, data.action, redrawn)
+    join(path, data.recipe, data.stage_borders, len(data.action), episodes)
+
+
+def join(
+    path: Path, recipe: dict[str, Any], stage_borders: NDArray[np.int64], count: int, episodes: Iterable[Episode]
+) -> Header:
+    """`write` for `count` episodes that come one after the other and are never in memory together."""
+    redrawn = 0
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with h5py.File(temporary, "w") as file:
+            for index, episode in enumerate(episodes):
+                if index == 0:
+                    for name in ("configuration", "action"):
+                        file.create_dataset(name, (count, *getattr(episode, name).shape), np.float64)
+                if not episode.is_finite():  # the last door: none may get here
+                    raise ModelError(f"episode {index} is not finite; not written to {path}")
+                file["configuration"][index] = episode.configuration
+                file["action"][index] = episode.action
+                redrawn += episode.redrawn
             file.attrs["schema"] = SCHEMA
-            file.attrs["recipe"] = json.dumps(data.recipe, sort_keys=True)
-            file.attrs["stage_borders"] = data.stage_borders
-            file.attrs["redrawn"] = data.redrawn
-            file.create_dataset("configuration", data=data.configuration)
-            file.create_dataset("action", data=data.action)
+            file.attrs["recipe"] = json.dumps(recipe, sort_keys=True)
+            file.attrs["stage_borders"] = stage_borders
+            file.attrs["redrawn"] = redrawn
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+    return Header(recipe, stage_borders, redrawn, count)
 
 
-def read(path: Path) -> DataSet:
-    """Reads a data set; `ModelError` says what was found where it is none, or damaged."""
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[h5py.File, Header]]:
     if not path.is_file():
         raise ModelError(f"no data set {path}; modsoft-collect --out {path} makes one")
     try:
@@ -84,15 +131,35 @@ def read(path: Path) -> DataSet:
             schema = int(file.attrs["schema"])
             if schema != SCHEMA:
                 raise ModelError(f"{path}: schema {schema}, this version reads {SCHEMA}; collect it again")
-            data = DataSet(
-                recipe=json.loads(file.attrs["recipe"]),
-                configuration=file["configuration"][()],
-                action=file["action"][()],
-                stage_borders=np.asarray(file.attrs["stage_borders"], dtype=np.int64),
-                redrawn=int(file.attrs["redrawn"]),
+            yield (
+                file,
+                Header(
+                    recipe=json.loads(file.attrs["recipe"]),
+                    stage_borders=np.asarray(file.attrs["stage_borders"], dtype=np.int64),
+                    redrawn=int(file.attrs["redrawn"]),
+                    episodes=len(file["action"]),
+                ),
             )
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise ModelError(f"{path}: not a data set of modsoft-collect, or damaged ({error})") from error
+
+
+def read_header(path: Path) -> Header:
+    """Reads what a data set says about itself; errors as in `read`."""
+    with _opened(path) as (_, header):
+        return header
+
+
+def read(path: Path) -> DataSet:
+    """Reads a data set; `ModelError` says what was found where it is none, or damaged."""
+    with _opened(path) as (file, header):
+        data = DataSet(
+            recipe=header.recipe,
+            configuration=file["configuration"][()],
+            action=file["action"][()],
+            stage_borders=header.stage_borders,
+            redrawn=header.redrawn,
+        )
     _check(data, path)
     return data
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.errors import RobotFileError
+from modsoft.runtime.errors import RobotFileError, UsageError
 from modsoft.runtime.robot import Robot
 from modsoft.training import kernel
 from modsoft.training.fleet import Arms, Fleet
@@ -29,15 +30,29 @@ class Plant(NamedTuple):
 
 def fastest(robot: Robot) -> Plant:
     """The compiled fleet where this installation has it, else PyElastica."""
+    return named(names()[0], robot)
+
+
+def names() -> list[str]:
+    """Of the plants that run here, the fastest first. The fleet's variants round differently from each other, so that
+    a name stands for one result wherever it runs."""
+    return [*(f"fleet-{variant}" for variant in reversed(kernel.variants())), "elastica"]
+
+
+def named(name: str, robot: Robot) -> Plant:
+    """The plant of that name; `UsageError` where it does not run here, `RobotFileError` if it cannot be this robot."""
+    if name not in names():
+        raise UsageError(f"the plant {name} does not run here; expected {', '.join(names())}")
     _check(robot)
-    built = kernel.variants()
-    # A vector of another width may round differently, so that a restart elsewhere would not give the same bits.
-    return Plant(f"fleet-{built[-1]}", by_fleet, together=16) if built else Plant("elastica", by_elastica, together=1)
+    if name == "elastica":
+        return Plant(name, by_elastica, together=1)
+    # As many as the kernel's lanes: fewer cost the same.
+    return Plant(name, functools.partial(by_fleet, variant=name.removeprefix("fleet-")), together=8)
 
 
-def by_fleet(robot: Robot, actions: Array) -> Array:
+def by_fleet(robot: Robot, actions: Array, variant: str | None = None) -> Array:
     """Robots side by side in compiled code."""
-    return _run(Fleet(robot.robot.kind, robot.modules, len(actions)), actions, robot.loop.period_s)
+    return _run(Fleet(robot.robot.kind, robot.modules, len(actions), variant=variant), actions, robot.loop.period_s)
 
 
 def by_elastica(robot: Robot, actions: Array) -> Array:
@@ -49,7 +64,9 @@ def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:
     configuration = [robots.configuration]
     for action in np.moveaxis(actions, 1, 0):
         robots.step(action, period_s)
-        configuration.append(robots.configuration)
+        reached = robots.configuration
+        reached[~robots.alive] = np.nan  # what was lost in the middle may not show at the module ends yet
+        configuration.append(reached)
     return np.stack(configuration, axis=1)
 
 

@@ -1,5 +1,6 @@
 """Reading, writing and splitting of data sets."""
 
+import h5py
 import numpy as np
 import pytest
 
@@ -60,8 +61,9 @@ def test_what_is_no_data_set_is_refused(tmp_path):
 
 def test_wrong_shapes_and_values_are_refused(tmp_path):
     path, data = tmp_path / "d.h5", make(2, 30)
-    data.configuration[0, 4, 1, 2] = np.nan
     d.write(data, path)
+    with h5py.File(path, "r+") as file:
+        file["configuration"][0, 4, 1, 2] = np.nan
     with pytest.raises(ModelError, match="configuration holds values that are not finite"):
         d.read(path)
     data = make(2, 30)

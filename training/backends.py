@@ -1,0 +1,182 @@
+"""Who makes the episodes: processes of this machine, the jobs of a SLURM cluster, or dask's workers.
+
+A backend runs task(bundle) for every bundle, at most `jobs` at a time, and yields now and then, so that the caller can
+look what is there; its own files go to `folder`. It raises the task's own error, or `WorkerLost` where a worker died
+and its work was not taken over. What the workers make they store themselves: they share the folder of the data set,
+and the same installation.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from modsoft.runtime.errors import DeviceAbsent, ModsoftError, UsageError
+from modsoft.training import workers
+from modsoft.training.workers import WorkerLost
+
+Bundle = list[int]
+Task = Callable[[Bundle], None]
+Options = dict[str, Any]
+
+LOOK_S = 1.0  # pause between two looks at the queue of a cluster
+# Jobs of an array: several for each that may run, so that a lost one costs little; SLURM's MaxArraySize is 1001.
+ARRAY_PER_JOB, LONGEST_ARRAY = 4, 1000
+
+
+def by_processes(task: Task, bundles: list[Bundle], jobs: int, folder: Path, options: Options) -> Iterator[None]:
+    """Processes of this machine; jobs = 1: this process."""
+    if options:
+        raise UsageError(f"backend local takes no option, found {', '.join(options)}; see --backend")
+    for _ in workers.run(task, bundles, jobs):
+        yield
+
+
+def by_submitit(task: Task, bundles: list[Bundle], jobs: int, folder: Path, options: Options) -> Iterator[None]:
+    """One array of SLURM jobs through submitit. options: parameters of submitit's executor (slurm_partition,
+    timeout_min, ...), or `cluster=local` to try it without SLURM."""
+    submitit = _extra("submitit", "slurm")
+    asked = {"name": "modsoft-collect", "timeout_min": 240, "slurm_array_parallelism": jobs, **options}
+    cluster = asked.pop("cluster", "slurm")
+    if cluster == "slurm" and shutil.which("sbatch") is None:
+        raise DeviceAbsent("no SLURM here: sbatch is not on the path; run on a login node, or use --backend local")
+    if not bundles:
+        return
+    executor = submitit.AutoExecutor(folder=folder / "jobs", cluster=cluster)
+    try:
+        executor.update_parameters(**asked)
+    except (NameError, TypeError, ValueError) as error:
+        raise UsageError(f"--backend-option: {' '.join(str(error).split())}") from error
+    share = -(-len(bundles) // min(len(bundles), ARRAY_PER_JOB * jobs, LONGEST_ARRAY))
+    chunks = [bundles[i : i + share] for i in range(0, len(bundles), share)]
+    left = executor.map_array(_Chunk(task), chunks)
+    try:
+        while left:
+            gone = _not_queued([job.job_id for job in left]) if cluster == "slurm" else set()
+            # In this order: a job that leaves the queue has left its result by then.
+            for job in [each for each in left if each.done() or each.job_id in gone]:
+                _take(job)
+                left.remove(job)
+            yield
+            if left:
+                time.sleep(LOOK_S)
+    finally:
+        for job in left:
+            job.cancel(check=False)
+
+
+class _Chunk:
+    """Bundles one after the other, as one job; gives the error that ended them."""
+
+    def __init__(self, task: Task):
+        self.task = task
+
+    def __call__(self, bundles: list[Bundle]) -> ModsoftError | None:
+        try:
+            for bundle in bundles:
+                self.task(bundle)
+        except ModsoftError as error:
+            return error
+        return None
+
+    def checkpoint(self, bundles: list[Bundle]) -> Any:
+        """What submitit queues again when the job runs out of time or is preempted: finished episodes are skipped."""
+        import submitit
+
+        return submitit.helpers.DelayedSubmission(self, bundles)
+
+
+def _take(job: Any) -> None:
+    """Raises what ended a job, if anything did."""
+    from submitit.core.utils import FailedJobError, UncompletedJobError
+
+    path = job.paths.result_pickle
+    deadline_s = time.monotonic() + 15.0  # for a network file system to show it
+    while not path.exists():
+        if time.monotonic() > deadline_s:
+            raise WorkerLost(f"job {job.job_id} was lost (cancelled, killed, or its node failed); run again to go on")
+        time.sleep(0.1)
+    try:
+        error = job.result()
+    except (FailedJobError, UncompletedJobError) as failed:
+        last = str(failed).strip().splitlines()[-1]
+        raise WorkerLost(f"job {job.job_id} failed: {last}; all of it is in {job.paths.stderr}") from failed
+    if error is not None:
+        raise error
+
+
+def _not_queued(ids: list[str]) -> set[str]:
+    """Those array jobs that SLURM neither runs nor will run. squeue, because sacct needs a data base that not every
+    cluster has."""
+    arrays = ",".join(sorted({each.split("_")[0] for each in ids}))
+    asked = ["squeue", "--noheader", "--array", "--format=%F_%K %T", f"--jobs={arrays}"]
+    found = subprocess.run(asked, capture_output=True, text=True, check=False)
+    if found.returncode != 0 and "Invalid job id" not in found.stderr:
+        return set()  # the controller is busy or away: asked again at the next look
+    queued = {line.split()[0] for line in found.stdout.splitlines()}
+    return {each for each in ids if each not in queued}
+
+
+def by_dask(task: Task, bundles: list[Bundle], jobs: int, folder: Path, options: Options) -> Iterator[None]:
+    """dask's workers; work of one that dies goes to another. options: `scheduler=ADDRESS` of a cluster that runs, or
+    `cluster=SLURMCluster` (or another class of dask-jobqueue) with that class's own parameters; neither: workers on
+    this machine."""
+    distributed = _extra("distributed", "dask")
+    if not bundles:
+        return
+    with ExitStack() as stack:
+        cluster = _dask_cluster(distributed, jobs, dict(options))
+        try:
+            client = distributed.Client(cluster if isinstance(cluster, str) else stack.enter_context(cluster))
+        except OSError as error:
+            raise DeviceAbsent(f"no dask scheduler at {cluster} ({error})") from error
+        futures = stack.enter_context(client).map(task, bundles, pure=False)
+        for future in distributed.as_completed(futures):
+            try:
+                future.result()
+            except distributed.scheduler.KilledWorker as error:
+                raise WorkerLost("the same work killed several of dask's workers in a row (out of memory?)") from error
+            yield
+
+
+def _dask_cluster(distributed: Any, jobs: int, options: Options) -> Any:
+    """An address, or a cluster to be closed."""
+    address, name = options.pop("scheduler", None), options.pop("cluster", "LocalCluster")
+    if address is not None:
+        return address
+    if name == "LocalCluster":
+        asked = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None, **options}
+        return distributed.LocalCluster(**asked, silence_logs=logging.CRITICAL)
+    jobqueue = _extra("dask_jobqueue", "dask")
+    if not hasattr(jobqueue, name):
+        raise UsageError(f"dask-jobqueue knows no cluster {name!r}; expected SLURMCluster, PBSCluster, ...")
+    cluster = getattr(jobqueue, name)(**options)
+    cluster.scale(jobs=jobs)
+    return cluster
+
+
+def _extra(module: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UsageError(f"this backend needs the extra {extra!r}: pip install 'modsoft[{extra}]' ({error})") from error
+
+
+BACKENDS: dict[str, Callable[[Task, list[Bundle], int, Path, Options], Iterator[None]]] = {
+    "local": by_processes,
+    "submitit": by_submitit,
+    "dask": by_dask,
+}
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
