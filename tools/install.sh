@@ -52,5 +52,5 @@ fi
 
 [ -x .venv/bin/python ] || "$python" -m venv .venv
 echo "install: Python packages into .venv"
-.venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --use-pep517 -c constraints.txt -e '.[dev]'
 echo "install: done"
