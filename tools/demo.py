@@ -106,7 +106,7 @@ def summary(report: dict[str, Any]) -> list[str]:
     """The short report of a run."""
     figures = report["figures"]
     late, acknowledged = figures["lateness_ms"], figures["acknowledged_ms"]
-    lines = [f"{ROBOT}, task {TASK}, {figures['ticks']} ticks on the {report['about']['board']}"]
+    lines = [f"{ROBOT}, task {TASK}, {figures['ticks']} ticks; board: {report['about']['board']}"]
     if "tracking_error_deg" in figures:
         error = figures["tracking_error_deg"]
         for module, (mean, std) in enumerate(zip(error["mean"], error["std"], strict=True), 1):

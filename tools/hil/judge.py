@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from modsoft.runtime.configuration import bending_angle_deg
 from modsoft.runtime.robot import Robot
+from modsoft.runtime.tally import spread
 
 Array = NDArray[np.float64]
 
@@ -126,10 +127,10 @@ class Verdict(NamedTuple):
 # ---- Figures ------------------------------------------------------------------------------------------------------
 
 
-def percentile(values: Array, share: float) -> float:
-    """The measured value that `share` percent do not exceed; never interpolated between two. NaN of nothing."""
-    values = np.asarray(values, dtype=np.float64)
-    return float(np.percentile(values, share, method="higher")) if len(values) else math.nan
+def p99(values: Array) -> float:
+    """The measured value that 99 percent do not exceed. NaN of nothing."""
+    found = spread(list(values))
+    return found["p99"] if found else math.nan
 
 
 def angle_between_deg(one: Array, other: Array) -> Array:
@@ -190,7 +191,7 @@ def at_most(name: str, found: float, limit: float, unit: str = "", timing: bool 
 def acceptances(record: Record) -> list[Acceptance]:
     """Every acceptance of the run, timing ones marked."""
     count = len(record.tick)
-    late_ms = percentile(record.lateness_ms, 99)
+    late_ms = p99(record.lateness_ms)
     unacknowledged = int(np.isnan(record.acknowledged_ms).sum())
     acknowledged = record.acknowledged_ms[~np.isnan(record.acknowledged_ms)]
     differences = valve_difference(record)
@@ -211,7 +212,7 @@ def acceptances(record: Record) -> list[Acceptance]:
             True,
         ),
         at_most("set-points never acknowledged", unacknowledged, 0, timing=True),
-        at_most("set-point to acknowledgement, 99th percentile", percentile(acknowledged, 99), ACKNOWLEDGED_P99_MS,
+        at_most("set-point to acknowledgement, 99th percentile", p99(acknowledged), ACKNOWLEDGED_P99_MS,
                 " ms", timing=True),
         at_most("valve outputs off the log, worst of every tick and channel", _worst(differences), VALVE_COUNTS,
                 " counts"),

@@ -16,17 +16,18 @@ from modsoft.hil.judge import (
     Verdict,
     angle_between_deg,
     measured_off_deg,
-    percentile,
     tracking_error_deg,
     valve_difference,
 )
 from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.tally import spread
 
 CLOCKS = (
-    "Tick lateness and acknowledgement times: the host's CLOCK_MONOTONIC, taken by modsoft-runtime. "
-    "Valve outputs: timer registers of the emulated board, stamped with its cycle counter and, for the comparison with "
-    "the log, with CLOCK_MONOTONIC at the moment of emulation. The simulated robot: CLOCK_MONOTONIC at absolute "
-    "deadlines. Tracking errors: from the runtime's own measurement, compared with the simulated robot's true state."
+    "Tick lateness and acknowledgement times: the host's CLOCK_MONOTONIC, taken by modsoft-runtime. Valve outputs: the "
+    "emulated board's timer registers (native board: what its logic asks for), stamped with its cycle counter and, for "
+    "the comparison with the log, with CLOCK_MONOTONIC at the moment of emulation. The simulated robot: the same clock, "
+    "at absolute deadlines. Tracking errors: from what the runtime measured, which is itself held against the simulated "
+    "robot's true state."
 )
 NOT_SHOWN = (
     "What this rig cannot show: electromagnetic noise, real USB latency, brown-out, the dynamics of air, "
@@ -42,11 +43,11 @@ def figures(record: Record) -> dict[str, Any]:
         "ticks": len(record.tick),
         "missed_ticks": record.missed,
         "held_ticks": record.held,
-        "lateness_ms": _spread(record.lateness_ms),
-        "acknowledged_ms": _spread(acknowledged),
-        "valve_difference_counts": _spread(valves[np.isfinite(valves)]),
+        "lateness_ms": spread(list(record.lateness_ms)),
+        "acknowledged_ms": spread(list(acknowledged)),
+        "valve_difference_counts": spread(list(valves[np.isfinite(valves)])),
         "board": record.board_summary,
-        "plant_late_ms": _spread(record.plant_late_ms),
+        "plant_late_ms": spread(list(record.plant_late_ms)),
     }
     if len(record.tick) and len(record.plant_mono_ns) > 1:
         error, off = tracking_error_deg(record), measured_off_deg(record)
@@ -58,7 +59,7 @@ def figures(record: Record) -> dict[str, Any]:
             "tracking_error_one_tick_later_deg": _by_module(due),
             "tracking_error_percent": _by_module(apart),
             "out_of_plane_deg": _by_module(_out_of_plane_deg(record)),
-            "measured_off_plant_deg": _spread(off[np.isfinite(off)]),
+            "measured_off_plant_deg": spread(list(off[np.isfinite(off)])),
         }
     return figure
 
@@ -95,9 +96,8 @@ def text(record: Record, verdict: Verdict, about: dict[str, str], found: dict[st
         lines += ["", "![desired and reached angles](angles.png)", "", *_tracking_table(found)]
     lines += ["", "| | median | 99th percentile | largest |", "| --- | --- | --- | --- |"]
     for name, key in TIMES.items():
-        spread = found[key]
-        if spread is not None:
-            lines.append(f"| {name} | {spread['p50']:.2f} | {spread['p99']:.2f} | {spread['max']:.2f} |")
+        if told := found[key]:
+            lines.append(f"| {name} | {told['p50']:.2f} | {told['p99']:.2f} | {told['max']:.2f} |")
     return "\n".join([*lines, "", f"Clocks. {CLOCKS}", "", NOT_SHOWN, ""])
 
 
@@ -171,12 +171,6 @@ def picture(record: Record) -> Figure:
 
 
 # ---- Helpers ------------------------------------------------------------------------------------------------------
-
-
-def _spread(values: np.ndarray) -> dict[str, float] | None:
-    if not len(values):
-        return None
-    return {"p50": percentile(values, 50), "p99": percentile(values, 99), "max": float(np.max(values))}
 
 
 def _by_module(values: np.ndarray) -> dict[str, list[float]]:
