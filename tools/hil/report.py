@@ -25,8 +25,8 @@ from modsoft.runtime.tally import spread
 CLOCKS = (
     "Tick lateness and acknowledgement times: the host's CLOCK_MONOTONIC, taken by modsoft-runtime. Valve outputs: the "
     "emulated board's timer registers (native board: what its logic asks for), stamped with its cycle counter and, for "
-    "the comparison with the log, with CLOCK_MONOTONIC at the moment of emulation. The simulated robot: the same clock, "
-    "at absolute deadlines. Tracking errors: from what the runtime measured, which is itself held against the simulated "
+    "the comparison with the log, with CLOCK_MONOTONIC at the moment of emulation. Simulated robot: the same clock, at "
+    "absolute deadlines. Tracking errors: from what the runtime measured, which is itself held against the simulated "
     "robot's true state."
 )
 NOT_SHOWN = (
