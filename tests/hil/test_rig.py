@@ -142,9 +142,11 @@ def rig_command(folder, model):
 @pytest.mark.realtime
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 def test_nothing_outlives_the_rig(number, code, model_file, tmp_path):
+    temporary = {"TMPDIR": str(tmp_path)}  # a killed process leaves its temporary folders
     with subprocess.Popen(
-        rig_command(tmp_path, model_file), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    ) as process:
+        rig_command(tmp_path, model_file), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        env={**os.environ, **temporary},
+    ) as process:  # fmt: skip
         try:
             wait_until(lambda: ticked(tmp_path) or process.poll() is not None, 30)
             assert process.poll() is None
