@@ -57,9 +57,7 @@ def cli(data_file: Path, out: Path, **options: Any) -> None:
     told = {name: value for name, value in options.items() if value is not None}
     settings = train.Settings(**{**train.BY_KIND[data.robot.robot.kind], **told})
     began_s, first, smooth = time.monotonic(), None, 0.0
-    with tqdm(
-        total=100, desc="train", bar_format="{desc}: {percentage:3.0f}%|{bar}| {remaining} left, {postfix}"
-    ) as bar:
+    with tqdm(total=100, desc="train", bar_format="{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}") as bar:
 
         def progress(told: train.Progress) -> None:
             nonlocal first, smooth
@@ -69,7 +67,7 @@ def cli(data_file: Path, out: Path, **options: Any) -> None:
             rate = (told.iteration - first) * settings.batch / (time.monotonic() - began_s)
             best = f"{told.validation_percent:.2f} %"
             bar.set_postfix_str(f"{rate:.0f} samples/s, loss {smooth:.5f}, best validation {best}", refresh=False)
-            bar.update(100 * told.share - bar.n)
+            bar.update(100 * min(told.share, 1.0) - bar.n)
 
         made = train.train(data, out, settings, progress)
     said = made["provenance"]
