@@ -28,6 +28,7 @@ Task = Callable[[Bundle], None]
 Options = dict[str, Any]
 
 LOOK_S = 1.0  # pause between two looks at the queue of a cluster
+SHOWN_S = 15.0  # until a network file system shows the result of a job that has ended
 # Jobs of an array: several for each that may run, so that a lost one costs little; SLURM's MaxArraySize is 1001.
 ARRAY_PER_JOB, LONGEST_ARRAY = 4, 1000
 
@@ -99,7 +100,7 @@ def _take(job: Any) -> None:
     from submitit.core.utils import FailedJobError, UncompletedJobError
 
     path = job.paths.result_pickle
-    deadline_s = time.monotonic() + 15.0  # for a network file system to show it
+    deadline_s = time.monotonic() + SHOWN_S
     while not path.exists():
         if time.monotonic() > deadline_s:
             raise WorkerLost(f"job {job.job_id} was lost (cancelled, killed, or its node failed); run again to go on")
@@ -132,12 +133,16 @@ def by_dask(task: Task, bundles: list[Bundle], jobs: int, folder: Path, options:
     distributed = _extra("distributed", "dask")
     if not bundles:
         return
+    address = options.get("scheduler")
     with ExitStack() as stack:
-        cluster = _dask_cluster(distributed, jobs, dict(options))
         try:
-            client = distributed.Client(cluster if isinstance(cluster, str) else stack.enter_context(cluster))
+            if address is None:
+                client = distributed.Client(stack.enter_context(_dask_cluster(distributed, jobs, dict(options))))
+            else:
+                others = {name: value for name, value in options.items() if name != "scheduler"}
+                client = distributed.Client(address, **{"timeout": 10, **others})
         except OSError as error:
-            raise DeviceAbsent(f"no dask scheduler at {cluster} ({error})") from error
+            raise DeviceAbsent(f"no dask cluster at {address or 'hand'} ({error}); is it running?") from error
         futures = stack.enter_context(client).map(task, bundles, pure=False)
         for future in distributed.as_completed(futures):
             try:
@@ -148,10 +153,8 @@ def by_dask(task: Task, bundles: list[Bundle], jobs: int, folder: Path, options:
 
 
 def _dask_cluster(distributed: Any, jobs: int, options: Options) -> Any:
-    """An address, or a cluster to be closed."""
-    address, name = options.pop("scheduler", None), options.pop("cluster", "LocalCluster")
-    if address is not None:
-        return address
+    """A cluster to be closed."""
+    name = options.pop("cluster", "LocalCluster")
     if name == "LocalCluster":
         asked = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None, **options}
         return distributed.LocalCluster(**asked, silence_logs=logging.CRITICAL)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.errors import ModsoftError, RobotFileError
+from modsoft.runtime.errors import ModsoftError, RobotFileError, UsageError
 from modsoft.training import arm, collect, dataset, kernel, plants
+from modsoft.training.fleet import Fleet
 
 needs_fleet = pytest.mark.skipif(not kernel.variants(), reason="the fleet's kernel is not built here")
 
@@ -55,6 +56,54 @@ def test_the_fleet_agrees_with_elastica_and_not_with_its_neighbours(name):
     np.testing.assert_allclose(together[:1], plants.by_elastica(robot, actions[:1]), rtol=0, atol=2e-4)
     for i in range(3):
         np.testing.assert_array_equal(plants.by_fleet(robot, actions[i : i + 1])[0], together[i])
+
+
+@needs_fleet
+def test_a_robot_that_goes_non_finite_in_the_fleet_is_dropped_and_drawn_again(tmp_path, monkeypatch):
+    """Planted in the middle of one rod at the last step, where no module end shows it yet."""
+    steps, victim, planted = 6, 3, []
+    step = Fleet.step
+
+    def poisoned(self, actuation, period_s=None):
+        step(self, actuation, period_s)
+        self.steps_done = getattr(self, "steps_done", 0) + 1
+        if self.steps_done == steps and self.count > victim and not planted:
+            planted.append(self)
+            self._state[victim // self.lanes, 2, 3, victim % self.lanes] = np.nan  # a velocity
+
+    robot = robots.load("pneumatic-2")
+    made = {}
+    for name in ("clean", "planted"):
+        if name == "planted":
+            monkeypatch.setattr(Fleet, "step", poisoned)
+        made[name] = collect.collect(robot, tmp_path / name, 8 * steps, "random", 2, steps)
+    clean, found = (dataset.read(tmp_path / name) for name in made)
+    assert len(planted) == 1
+    assert (made["clean"].redrawn, made["planted"].redrawn) == (0, 1)
+    assert np.isfinite(found.configuration).all()
+    others = [index for index in range(8) if index != victim]
+    np.testing.assert_array_equal(found.configuration[others], clean.configuration[others])
+    assert not np.array_equal(found.action[victim], clean.action[victim])
+    monkeypatch.undo()
+    again = plants.by_fleet(robot, found.action[[victim]])
+    np.testing.assert_array_equal(again[0], found.configuration[victim])
+
+
+def test_a_plant_is_had_by_its_name():
+    robot = robots.load("pneumatic-2")
+    assert plants.names()[-1] == "elastica"
+    assert plants.fastest(robot).name == plants.names()[0]
+    assert plants.named("elastica", robot).simulate is plants.by_elastica
+    with pytest.raises(UsageError, match=r"the plant fleet-other does not run here; expected .*elastica"):
+        plants.named("fleet-other", robot)
+
+
+@needs_fleet
+def test_a_named_variant_gives_the_same_bits_everywhere():
+    robot, actions = draw("pneumatic-2", 2, 3)
+    plain = plants.named("fleet-plain", robot).simulate(robot, actions)
+    np.testing.assert_array_equal(plain, plants.by_fleet(robot, actions, "plain"))
+    np.testing.assert_allclose(plain, plants.fastest(robot).simulate(robot, actions), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -111,5 +160,20 @@ def test_help_comes_without_the_simulator(tmp_path):
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     found = subprocess.run(command("--help"), capture_output=True, text=True, check=False)
     assert found.returncode == 0
-    for option in ("--out", "--samples", "--strategy", "--seed", "Example"):
+    for option in ("--out", "--samples", "--strategy", "--seed", "--backend", "plot DATASET", "Example"):
         assert option in found.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "missing option --out"),
+        (["--out", "d.h5", "--backend-option", "fast"], "--backend-option fast: expected NAME=VALUE"),
+        (["--out", "d.h5", "--backend-option", "fast=1"], "backend local takes no option, found fast"),
+        (["--out", "d.h5", "--plant", "other"], "the plant other does not run here"),
+    ],
+)
+def test_what_is_missing_or_wrong_is_told(tmp_path, arguments, message):
+    found = subprocess.run(command(*arguments), cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert found.returncode == 2
+    assert message in found.stderr
