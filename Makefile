@@ -9,7 +9,7 @@ export MPLBACKEND ?= Agg
 PYTEST := .venv/bin/python -m pytest
 INSTALLED := .venv/.installed
 
-.PHONY: demo install test check firmware clean
+.PHONY: demo install test test-cluster check firmware clean
 
 demo: $(INSTALLED)
 	.venv/bin/python tools/demo.py
@@ -24,8 +24,12 @@ $(INSTALLED): pyproject.toml setup.py constraints.txt tools/install.sh training/
 
 # Tests judged against the wall clock run alone, after all others.
 test: $(INSTALLED)
-	$(PYTEST) -n 2 --dist worksteal -m "not realtime"
+	$(PYTEST) -n 2 --dist worksteal -m "not realtime and not cluster"
 	$(PYTEST) -m realtime
+
+# Collection through a real one-node SLURM, which the test installs and starts: root on Debian.
+test-cluster: $(INSTALLED)
+	$(PYTEST) -m cluster
 
 check: $(INSTALLED)
 	tools/check.sh
