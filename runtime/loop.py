@@ -79,6 +79,7 @@ class Loop:
         window = Window(self.model.history, state, robot.action_size)
         # The history begins with actuation 0, so the robot is given it for one period before the first step.
         bar = channel_pressures_bar(robot, applied, CHANNELS)
+        self._idle()  # arming takes a second: who asked to stop in it must not see a valve open first
         sequence = self.valves.set_pressures(0, bar)
         self.ticker.start(robot.loop.period_s)
         self.log({"event": "start", "mono_ns": _ns(self.ticker.now()), "commanded_bar": bar})
@@ -96,32 +97,32 @@ class Loop:
             step = tick.index
             frame = self.slot.latest()
             judged = self.judge.judge(frame, self.ticker.now())
-            guard.frame(judged)
             desired = self.desired[step]
             line = self._begun(tick, frame, judged, desired, acknowledged)
-
-            raw = None
-            actuation = applied  # held where there is no good frame
-            if judged.configuration is not None:
-                state = state_of(judged.configuration, kind)
-            window.observe(state)
-            if judged.configuration is not None:
-                raw = self.model.actuate(window.features(state_of(desired, kind)))
-                check_actuation(raw)
-                actuation = limited(raw, applied, robot.limits.largest_actuation_step)
-            bar = channel_pressures_bar(robot, actuation, CHANNELS)
-            sent = not self.ticker.too_late(step)
-            if sent:
-                sequence = self.valves.set_pressures(step + 1, bar)
-                applied = actuation
-                guard.on_time()
-            else:
-                self.valves.beat(step + 1)
-                guard.missed(1)
-            window.applied(applied)
-            line |= {"sent": sent, "raw": raw, "actuation": applied, "commanded_bar": bar if sent else None}
-            line["step_ms"] = (self.ticker.now() - tick.start_s) * 1e3
-            self.log(line)
+            line |= {"sent": False, "raw": None, "actuation": applied, "commanded_bar": None}
+            try:
+                guard.frame(judged)
+                actuation = applied  # held where there is no good frame
+                if judged.configuration is not None:
+                    state = state_of(judged.configuration, kind)
+                window.observe(state)
+                if judged.configuration is not None:
+                    line["raw"] = raw = self.model.actuate(window.features(state_of(desired, kind)))
+                    check_actuation(raw)
+                    actuation = limited(raw, applied, robot.limits.largest_actuation_step)
+                bar = channel_pressures_bar(robot, actuation, CHANNELS)
+                if not self.ticker.too_late(step):
+                    sequence = self.valves.set_pressures(step + 1, bar)
+                    applied = actuation
+                    line |= {"sent": True, "actuation": applied, "commanded_bar": bar}
+                    guard.on_time()
+                else:
+                    self.valves.beat(step + 1)
+                    guard.missed(1)
+                window.applied(applied)
+            finally:  # the step that ended a run is the one that everybody wants to see
+                line["step_ms"] = (self.ticker.now() - tick.start_s) * 1e3
+                self.log(line)
             self.tally.add(line, tick, judged)
 
     def _idle(self) -> None:

@@ -280,6 +280,34 @@ def test_whoever_wants_to_stop_is_obeyed_between_two_ticks(error):
     assert world.time_s == pytest.approx(world.due_s(5))
 
 
+def test_whoever_wanted_to_stop_during_arming_sees_no_valve_open():
+    world = World(steps=20)
+    world.stop.request(Interrupted(2))
+    with pytest.raises(Interrupted):
+        world.run()
+    assert world.sent == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "verdict", "raw"),
+    [
+        (lambda world: world.hide(2), Tripped, "tool hidden", None),
+        (lambda world: setattr(world, "answer", lambda features: np.full((3, 1), 50.0)), ModelError, "good", 50.0),
+    ],
+)
+def test_the_step_that_ends_a_run_is_in_its_log(fault, error, verdict, raw):
+    world = World(steps=20)
+    world.at[5] = lambda: fault(world)
+    with pytest.raises(error):
+        world.run()
+    line = world.ticks[-1]
+    assert line["due_ns"] == pytest.approx((world.time_s - (0.001 if raw else 0.0)) * 1e9, abs=1e6)
+    assert (line["verdict"], line["sent"], line["commanded_bar"]) == (verdict, False, None)
+    assert np.array_equal(line["actuation"], world.ticks[-2]["actuation"])
+    assert line["raw"] is None if raw is None else np.all(line["raw"] == raw)
+    assert len(world.tally.late_ms) == len(world.ticks) - 1  # it is no finished step
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -50.0])
 def test_what_the_model_must_not_answer_is_not_sent(value):
     world = World(steps=20)
