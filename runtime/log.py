@@ -7,7 +7,7 @@ that the loop never waits for a disk and a killed process loses nothing. A tick:
     mono_ns, due_ns       CLOCK_MONOTONIC when it began, and when it was due
     wall                  UTC, ISO 8601
     late_ms, missed       lateness; control steps that were skipped just before this one
-    sent                  whether set-points went out (false: the step took more than half a period)
+    sent                  whether set-points went out (false: the step took more than half a period, or ended the run)
     verdict               "good", or why the frame was not used; then the command before was held
     frame                 null, or number (the device's), mono_ns (before it was asked), age_ms, poses (N + 1, 4, 4) in
                           mm, valid (N + 1), quality (N + 1)
@@ -28,6 +28,7 @@ vented: whether the board said so). What is not a number is null.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -69,6 +70,7 @@ class Writer:
     def __init__(self, path: Path, write: Callable[[int, bytes], int] = os.write):
         self.lost = 0
         self.error: str | None = None
+        self._handed = self._done = 0  # lines taken, and lines that the disk took or refused
         self._write = write
         binary = getattr(os, "O_BINARY", 0)  # Windows would make two bytes of each line's end
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | binary, 0o644)
@@ -81,20 +83,23 @@ class Writer:
         """Hands a line over; never waits. The line may not be changed any more."""
         try:
             self._queue.put_nowait(line)
+            self._handed += 1
         except queue.Full:
             self.lost += 1
 
     def close(self) -> None:
-        """Writes what is left. A disk that hangs is not waited for longer than two seconds."""
-        try:
+        """Writes what is left. A disk that hangs is not waited for longer than four seconds; what it still owes by then
+        counts as lost."""
+        with contextlib.suppress(queue.Full):
             self._queue.put(None, timeout=CLOSE_WAIT_S)
-        except queue.Full:
-            return
-        self._thread.join(CLOSE_WAIT_S)
+            self._thread.join(CLOSE_WAIT_S)
+        if self._thread.is_alive():
+            self.lost += self._handed - self._done
 
     def _run(self) -> None:
         while (line := self._queue.get()) is not None:
             self._out(json.dumps(plain(line), separators=(",", ":"), allow_nan=False).encode() + b"\n")
+            self._done += 1
         os.close(self._file)
 
     def _out(self, data: bytes) -> None:

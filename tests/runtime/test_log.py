@@ -134,6 +134,27 @@ def test_a_disk_that_hangs_does_not_hold_the_loop(tmp_path):
     writer.close()
 
 
+@pytest.mark.parametrize("lines", [3, logs.QUEUE_LINES + 1])
+def test_what_a_hanging_disk_still_owes_at_the_end_is_told(tmp_path, monkeypatch, lines):
+    freed, begun = threading.Event(), threading.Event()
+
+    def hang(file: int, data: bytes) -> int:
+        begun.set()
+        freed.wait(30)
+        return len(data)
+
+    monkeypatch.setattr(logs, "CLOSE_WAIT_S", 0.01)
+    writer = logs.Writer(tmp_path / "run.jsonl", hang)
+    writer.put({"tick": 0})
+    assert begun.wait(5)
+    for tick in range(1, lines):
+        writer.put({"tick": tick})
+    assert writer.lost == 0
+    writer.close()
+    assert writer.lost == lines
+    freed.set()
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_a_real_full_device(tmp_path):
     (tmp_path / "run.jsonl").symlink_to("/dev/full")
