@@ -299,10 +299,14 @@ class Board:
                     self._changed.wait(0.05)
 
     def _serve(self) -> None:
-        while not self._stop.is_set() and self._pump():
-            pass
-        with self._changed:
-            self._changed.notify_all()
+        try:
+            while not self._stop.is_set() and self._pump():
+                pass
+        finally:
+            with self._changed:
+                if not self._stop.is_set():  # a bug: nothing is sent any more, and the loop has to know
+                    self._link.hang_up("the thread of the port ended by an error", self._clock())
+                self._changed.notify_all()
 
     def _pump(self) -> bool:
         """One turn: what came, what has to go. False when the port failed."""

@@ -78,6 +78,19 @@ def test_failing_port_is_a_lost_board_and_wakes_who_waits(failure):
     assert port.closed
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_bug_in_the_thread_is_a_lost_board_too():
+    """What no driver should raise: nothing would be sent any more, and nobody would know."""
+    port = ScriptedPort()
+    board = Board(port)
+    port.failure = TypeError("an integer is required")
+    port.reader.join(1.0)
+    assert not port.reader.is_alive()
+    with pytest.raises(LostInRun, match="ended by an error"):
+        board.check()
+    assert board.close() is False
+
+
 def test_port_that_fails_before_hello():
     port = ScriptedPort()
     port.failure = OSError(5, "Input/output error")
