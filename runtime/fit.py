@@ -6,12 +6,15 @@ from modsoft.runtime.errors import ProtocolMismatch, RobotFileError
 from modsoft.runtime.protocol import Hello, to_bar, to_units
 from modsoft.runtime.robot import Robot
 
+LONGEST_STEP = 1.5  # periods between two commands of a loop that misses none: one in time, the next half a period late
+
 
 def check_board(hello: Hello, robot: Robot, name: str) -> int:
     """Return the mask of the valve channels that the robot uses; bit c stands for channel c.
 
-    name: the board's port, for messages. Raises `ProtocolMismatch` where valve full scale, pressure range, slew or
-    channels of board and robot file do not go together, `RobotFileError` for a robot without valves.
+    name: the board's port, for messages. Raises `ProtocolMismatch` where valve full scale, pressure range, slew,
+    control time-out or channels of board and robot file do not go together, `RobotFileError` for a robot without
+    valves.
     """
     valve = robot.valve
     if valve is None:
@@ -31,6 +34,13 @@ def check_board(hello: Hello, robot: Robot, name: str) -> int:
         raise ProtocolMismatch(
             f"the board at {name} moves pressures at {to_bar(hello.slew):g} bar/s, the robot file allows "
             f"{robot.limits.slew_bar_per_s:g}; correct SLEW in firmware/limits.h and flash it, or slew_bar_per_s"
+        )
+    longest_s = hello.control_timeout_ms / 1000
+    if longest_s <= LONGEST_STEP * robot.loop.period_s:
+        raise ProtocolMismatch(
+            f"the board at {name} vents when no control step comes for {longest_s:g} s, and at {robot.loop.hz:g} Hz up "
+            f"to {LONGEST_STEP * robot.loop.period_s:g} s may lie between two; raise hz under [loop] in the robot "
+            "file, or CONTROL_TIMEOUT_MS in firmware/limits.h"
         )
     for chamber in robot.chambers:
         if chamber.channel >= hello.channels:

@@ -264,6 +264,7 @@ def test_line_noise_instead_of_frames(new_board):
         ("p_min_bar = 0.08", "p_min_bar = 0.1", "smallest pressure"),
         ("p_max_bar = 0.35", "p_max_bar = 0.3", "largest pressure"),
         ("slew_bar_per_s = 2.0", "slew_bar_per_s = 1.0", "at 2 bar/s, the robot file allows 1"),
+        ("hz = 2.5", "hz = 1.5", "vents when no control step comes for 1 s, and at 1.5 Hz up to 1 s"),
         ("channel = 5", "channel = 11", "channel 11, the board at virtual has channels 0 to 10"),
     ],
 )
