@@ -27,8 +27,8 @@ Bundle = list[int]
 Task = Callable[[Bundle], None]
 Options = dict[str, Any]
 
-LOOK_S = 1.0  # pause between two looks at the queue of a cluster
-SHOWN_S = 15.0  # until a network file system shows the result of a job that has ended
+LOOK_S = 3.0  # pause between two looks at the queue of a cluster
+SHOWN_S = 20.0  # until a network file system shows the result of a job that has ended
 # Jobs of an array: several for each that may run, so that a lost one costs little; SLURM's MaxArraySize is 1001.
 ARRAY_PER_JOB, LONGEST_ARRAY = 4, 1000
 
@@ -61,9 +61,7 @@ def by_submitit(task: Task, bundles: list[Bundle], jobs: int, folder: Path, opti
     left = executor.map_array(_Chunk(task), chunks)
     try:
         while left:
-            gone = _not_queued([job.job_id for job in left]) if cluster == "slurm" else set()
-            # In this order: a job that leaves the queue has left its result by then.
-            for job in [each for each in left if each.done() or each.job_id in gone]:
+            for job in _ended(left, cluster):
                 _take(job)
                 left.remove(job)
             yield
@@ -95,20 +93,34 @@ class _Chunk:
         return submitit.helpers.DelayedSubmission(self, bundles)
 
 
+def _ended(jobs: list[Any], cluster: str) -> list[Any]:
+    if cluster != "slurm":
+        return [job for job in jobs if job.done()]
+    gone = _not_queued([job.job_id for job in jobs])
+    names = _listed(jobs[0].paths.folder)
+    return [job for job in jobs if job.paths.result_pickle.name in names or job.job_id in gone]
+
+
+def _listed(folder: Path) -> set[str]:
+    """A network file system would go on denying a file that it was asked for too early; a list is fresh."""
+    return set(os.listdir(folder))
+
+
 def _take(job: Any) -> None:
     """Raises what ended a job, if anything did."""
-    from submitit.core.utils import FailedJobError, UncompletedJobError
+    from submitit.core.utils import FailedJobError
 
     path = job.paths.result_pickle
     deadline_s = time.monotonic() + SHOWN_S
-    while not path.exists():
+    while path.name not in _listed(path.parent):
         if time.monotonic() > deadline_s:
             raise WorkerLost(f"job {job.job_id} was lost (cancelled, killed, or its node failed); run again to go on")
         time.sleep(0.1)
     try:
         error = job.result()
-    except (FailedJobError, UncompletedJobError) as failed:
-        last = str(failed).strip().splitlines()[-1]
+    except FailedJobError as failed:
+        trace = str(failed).split("-" * 22)  # between two such rules
+        last = trace[1].strip().splitlines()[-1] if len(trace) > 2 else "no reason given"
         raise WorkerLost(f"job {job.job_id} failed: {last}; all of it is in {job.paths.stderr}") from failed
     if error is not None:
         raise error

@@ -1,6 +1,7 @@
 """Workers elsewhere: what they make is the same, and what happens when they die."""
 
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -31,6 +32,8 @@ STAND_IN = """
 
         def __call__(self, robot, actions):
             if self.mode and any(np.array_equal(each, self.marked) for each in actions):
+                if self.mode == "bug":
+                    raise ZeroDivisionError("a bug")
                 if self.mode == "raise":
                     raise ModelError("no plant")
                 if self.mode == "always" or not self.flag.exists():
@@ -102,9 +105,16 @@ def test_jobs_of_submitit_make_the_same_and_a_killed_one_is_told_and_gone_on_fro
     assert not (tmp_path / "d.h5.parts").exists()
 
 
-def test_jobs_of_submitit_hand_on_the_error_of_the_work(tmp_path):
+@pytest.mark.parametrize(
+    ("mode", "told"),
+    [
+        ("raise", r"ModelError: no plant$"),
+        ("bug", r"WorkerLost: job \d+(_\d+)? failed: ZeroDivisionError: a bug; all of"),
+    ],
+)
+def test_jobs_of_submitit_hand_on_the_error_of_the_work(tmp_path, mode, told):
     pytest.importorskip("submitit", reason="extra slurm")
-    assert "ModelError: no plant" in collected(tmp_path, "d.h5", "submitit", "raise", "cluster=local", expect=1).stderr
+    assert re.search(told, collected(tmp_path, "d.h5", "submitit", mode, "cluster=local", expect=1).stderr, re.M)
 
 
 def test_a_process_that_dies_is_told_and_gone_on_from(tmp_path, straight):
@@ -193,9 +203,9 @@ def test_a_lost_job_is_told(tmp_path, monkeypatch):
 
     class Job:
         job_id = "7_1"
-        paths = type("Paths", (), {"result_pickle": tmp_path / "none"})
+        paths = type("Paths", (), {"result_pickle": tmp_path / "none", "folder": tmp_path})
 
-    clock = iter(range(0, 100, 10))
+    clock = iter(range(0, 1000, 10))
     monkeypatch.setattr(backends.time, "monotonic", lambda: next(clock))
     monkeypatch.setattr(backends.time, "sleep", lambda seconds: None)
     with pytest.raises(WorkerLost, match="job 7_1 was lost"):
