@@ -174,14 +174,24 @@ def check_actuation(raw: Array) -> None:
         )
 
 
-def check_rest(configuration: Array) -> None:
-    """Raises `Tripped` where the configuration (N, 3) is not that of a robot that hangs at rest."""
+def check_rest(configuration: Array, poses: Array) -> None:
+    """Raises `Tripped` where the configuration (N, 3) and its poses (N + 1, 4, 4), base first, are not those of a robot
+    that hangs at rest: modules all but straight, each end further along than the one before, since tools in a wrong
+    order look straight too. The base's tool may sit anywhere on the base, so its place tells nothing."""
     bent = np.degrees(np.arccos(np.clip(configuration[:, 2], -1.0, 1.0)))
     if np.any(bent > REST_LIMIT_DEG):
         worst = int(np.argmax(bent))
         raise Tripped(
             f"module {worst + 1} stands at {bent[worst]:.0f} degrees although the robot is vented, expected at most "
             f"{REST_LIMIT_DEG:g}; are the tools in the order base, module 1, ... with z along the robot?"
+        )
+    ends, along = poses[1:, :3, 3], poses[1:-1, :3, 2]
+    ahead_mm = np.sum(np.diff(ends, axis=0) * along, axis=-1)
+    if np.any(ahead_mm <= 0.0):
+        first = int(np.argmax(ahead_mm <= 0.0))
+        raise Tripped(
+            f"the tool of module {first + 2} hangs {-ahead_mm[first]:.0f} mm behind that of module {first + 1}, not "
+            "further along; give the tools in the order base, module 1, ... with z from base to tip"
         )
 
 

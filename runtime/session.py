@@ -76,6 +76,9 @@ def run(options: Options) -> None:
     robot, robot_text, beside = _robot(options)
     port = options.port or robot.serial.port
     if not options.dry_run:
+        if robot.tracker.source == "replay":
+            raise UsageError("recorded frames say nothing of where the robot is, so no valve is driven by them; "
+                             "give --dry-run, or --tracker ndi")  # fmt: skip
         _check_port(port)
     controller, digest = _model(options.model, robot)
     task = options.task or robot.loop.task
@@ -218,9 +221,10 @@ def _rest(slot: Slot, judge: FrameJudge, stop: Stop, now: Callable[[], float] = 
     """The configuration (N, 3) in which the vented robot hangs; waits for the tracker's first good frame."""
     until_s = now() + FIRST_FRAME_WAIT_S
     while True:
-        judged = judge.judge(slot.latest(), now())
-        if judged.configuration is not None:
-            check_rest(judged.configuration)
+        frame = slot.latest()
+        judged = judge.judge(frame, now())
+        if frame is not None and judged.configuration is not None:
+            check_rest(judged.configuration, frame.poses)
             return judged.configuration
         if slot.error is not None:
             raise DeviceAbsent(f"tracker: {slot.error}")

@@ -151,6 +151,12 @@ def test_the_tracker_does_not_exist(tmp_path, port, model_file, tools):
     assert port.read_bytes() == b""
 
 
+def test_recorded_frames_drive_no_valve(tmp_path, port, model_file):
+    told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file]
+    line = refused(2, *told, "--tracker", "replay", "--tracker-port", tmp_path)
+    assert "--dry-run" in line
+
+
 def test_no_tools_told(port, model_file):
     told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
     line = refused(2, *told)

@@ -210,7 +210,28 @@ def test_an_answer_a_little_out_of_range_is_left_to_the_limits():
     check_actuation(np.array([[1.2], [-1.2], [0.0]]))
 
 
+def rest(poses):
+    check_rest(FrameJudge(ROBOT).judge(frame(1, 1.0, poses=poses), 1.0).configuration, poses)
+
+
 def test_rest():
-    check_rest(np.array([[0.0, 0.0, 1.0]] * 3))
+    rest(planar_poses((0.0, 0.0, 0.0)))
+    rest(planar_poses((3.0, 40.0, -59.0)))
     with pytest.raises(Tripped, match="module 2 stands at 90 degrees"):
-        check_rest(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+        rest(planar_poses((0.0, 90.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("order", "module"), [((0, 2, 1, 3), 2), ((0, 1, 3, 2), 3), ((0, 3, 2, 1), 2), ((0, 3, 1, 2), 2), ((0, 2, 3, 1), 3)]
+)
+def test_a_straight_robot_with_its_tools_in_a_wrong_order_is_not_at_rest(order, module):
+    """Every module of it looks straight, and a controller would bend the wrong ones."""
+    poses = planar_poses((1.0, -2.0, 3.0))
+    with pytest.raises(Tripped, match=f"the tool of module {module} hangs .* mm behind that of module {module - 1}"):
+        rest(poses[list(order)])
+
+
+def test_the_tool_of_the_base_may_sit_anywhere_on_it():
+    poses = planar_poses((0.0, 0.0, 0.0))
+    poses[0, :3, 3] = [200.0, -30.0, 150.0]
+    rest(poses)
