@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from modsoft.hil.emulator import is_event
 from modsoft.hil.rig import Rig
 from modsoft.runtime import log as logs
 
@@ -32,6 +33,7 @@ class Runtime:
     def __init__(self, rig, model, folder, terminal=subprocess.DEVNULL, said=None):
         """`terminal`: its standard input, and the terminal of its session; `said`: where its words go, not a file."""
         self.rig, self.folder = rig, folder
+        self.began = len(rig.board.trace)
         tools = [option for path in rig.tool_files for option in ("--tool", str(path))]
         command = [
             SCRIPT, "--yes", "--robot", "pneumatic-3", "--model", model, "--task", "down", "--port", rig.board.port,
@@ -64,8 +66,11 @@ class Runtime:
         return max(self.rig.board.duties()) > 0
 
     def left(self):
-        """The exit code."""
-        return self.process.wait(WITHIN_S)
+        """The exit code; the rig then knows all that the board did until the port was closed. Its events come through a
+        pipe, on a busy machine some time after the process has ended."""
+        code = self.process.wait(WITHIN_S)
+        self.rig.board.wait_for(is_event("uart-close"), 5.0, since=self.began)
+        return code
 
     def log(self):
         [folder] = (self.folder / "runs").iterdir()
