@@ -283,7 +283,7 @@ def test_a_folder_that_is_not_there_is_a_usage_error(tmp_path):
 
 
 SCRIPT = """
-    import sys, time
+    import os, sys, time
     from pathlib import Path
     import stand_in
     from modsoft.runtime import robot as robots
@@ -295,7 +295,7 @@ SCRIPT = """
         def __init__(self, delay):
             self.delay = delay
         def __call__(self, robot, actions):
-            print("begun", len(actions), flush=True)
+            os.write(1, f"begun {len(actions)}\n".encode())  # at once, for two processes write to this pipe
             time.sleep(self.delay)
             return stand_in.simulate(robot, actions)
 
@@ -355,3 +355,30 @@ def test_an_error_in_a_worker_ends_the_command_with_its_own_message(tmp_path):
     assert "no plant" in found.stderr
     assert not (tmp_path / "d.h5").exists()
     assert json.loads((tmp_path / "d.h5.parts" / "recipe.json").read_text())["seed"] == 5
+
+
+MEMORY = """
+    import resource, sys
+    from pathlib import Path
+    import stand_in
+    from modsoft.runtime import robot as robots
+    from modsoft.training.collect import collect
+    from modsoft.training.plants import Plant
+
+    collect(robots.load("cable-4"), Path("d.h5"), int(sys.argv[1]), plant=Plant("stand-in", stand_in.simulate, 8))
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+
+
+def test_memory_does_not_grow_with_the_number_of_samples(tmp_path):
+    peaks_mib, sizes_mib = [], []
+    (tmp_path / "stand_in.py").write_text(STAND_IN)
+    (tmp_path / "script.py").write_text(textwrap.dedent(MEMORY))
+    for samples in (16_000, 160_000):
+        command = [sys.executable, "script.py", str(samples)]
+        found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        peaks_mib.append(float(found.stdout))
+        sizes_mib.append((tmp_path / "d.h5").stat().st_size / 2**20)
+        (tmp_path / "d.h5").unlink()
+    assert sizes_mib[1] - sizes_mib[0] > 20
+    assert peaks_mib[1] - peaks_mib[0] < 5
