@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import TextIO
 
 PERIOD_S = 0.2
+END_WAIT_S = 0.05  # the valves are vented after it
 
 
 class StatusLine:
@@ -32,7 +33,7 @@ class StatusLine:
     ) -> None:
         self._done.set()
         if self._thread is not None:
-            self._thread.join(2 * PERIOD_S)
+            self._thread.join(END_WAIT_S)
 
     def _run(self) -> None:
         shown = ""

@@ -133,7 +133,7 @@ class Arm(NamedTuple):
 
 
 class Set(NamedTuple):
-    """Host to board: set-points of all channels, 0 or p_min to p_max; the newest wins, nothing is sent again."""
+    """Host to board: set-points of all channels, 0 to p_max; the newest wins, nothing is sent again."""
 
     tick: U32
     pressures: Pressures
