@@ -359,10 +359,11 @@ def test_skipped_ticks_go_into_the_history_as_held():
     np.testing.assert_allclose(actions, [0.05 * after] * 3)
 
 
-def test_a_long_stall_ends_the_run():
+@pytest.mark.parametrize("missed", [3, 5])
+def test_a_long_stall_ends_the_run(missed):
     world = World(steps=20)
-    world.at[4] = lambda: setattr(world, "time_s", world.time_s + 5 * PERIOD_S)
-    with pytest.raises(Tripped, match="missed"):
+    world.at[4] = lambda: setattr(world, "time_s", world.time_s + (missed + 0.3) * PERIOD_S)
+    with pytest.raises(Tripped, match=f"{missed} control ticks in a row were missed"):
         world.run()
 
 
