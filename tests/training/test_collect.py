@@ -295,7 +295,7 @@ SCRIPT = """
         def __init__(self, delay):
             self.delay = delay
         def __call__(self, robot, actions):
-            os.write(1, f"begun {len(actions)}\n".encode())  # at once, for two processes write to this pipe
+            os.write(1, b"begun %d\\n" % len(actions))  # at once, for two processes write to this pipe
             time.sleep(self.delay)
             return stand_in.simulate(robot, actions)
 
