@@ -1,5 +1,7 @@
 """What a lab PC gets: the wheel with no extra, in an environment of its own."""
 
+import json
+import random
 import shutil
 import subprocess
 import sys
@@ -62,3 +64,30 @@ def test_no_extra_gives_a_working_runtime_without_the_heavy_packages(clean):
     subprocess.run([runtime, "--check", "robot.toml"], cwd=clean, check=True)
     helped = subprocess.run([runtime, "--help"], capture_output=True, text=True, check=True)
     assert "--port" in helped.stdout
+
+
+def hanging_still(path, seconds=6.0, hz=20.0):
+    """A run log in which four tools hang straight under each other, with a little noise as a tracker has it."""
+    rng = random.Random(1)
+    with path.open("w") as file:
+        for k in range(int(seconds * hz)):
+            pose = [
+                [[1, 0, 0, rng.gauss(0, 0.05)], [0, 1, 0, rng.gauss(0, 0.05)], [0, 0, 1, 50.0 * tool], [0, 0, 0, 1]]
+                for tool in range(4)
+            ]
+            seen = {"number": 1 + k, "mono_ns": int(k / hz * 1e9), "poses": pose, "valid": [True] * 4}
+            file.write(json.dumps({"tick": k, "frame": {**seen, "quality": [0.1] * 4}}) + "\n")
+
+
+@pytest.mark.realtime
+def test_the_lab_pc_runs_a_model_without_the_packages_that_made_it(clean, model_file):
+    """onnxruntime, the golden pairs, the loop and the log, on recorded frames and without a board."""
+    (clean / "robot.toml").write_text((ROOT / "runtime/robots/pneumatic-3.toml").read_text())
+    shutil.copy(model_file, clean / "model.onnx")
+    hanging_still(clean / "run.jsonl")
+    replayed = ("--dry-run", "--yes", "--steps", "4", "--tracker", "replay", "--tracker-port", "run.jsonl")
+    subprocess.run([clean / "venv/bin/modsoft-runtime", *replayed], cwd=clean, check=True)
+    log = next((clean / "runs").glob("*/run.jsonl")).read_text().splitlines()
+    ticks = [line for line in map(json.loads, log) if "tick" in line]
+    assert [line["tick"] for line in ticks] == [0, 1, 2, 3]
+    assert all(len(line["raw"]) == 3 for line in ticks)
