@@ -42,6 +42,18 @@ def bending_angle_deg(configuration: Array) -> Array:
     return np.degrees(np.arctan2(configuration[..., 0], configuration[..., 2]))
 
 
+def bending_error_deg(configuration: Array, desired: Array) -> Array:
+    """Distance (...), 0 to 180 degrees, between the bending angles of two planar configurations (..., 3)."""
+    off = bending_angle_deg(configuration) - bending_angle_deg(desired)
+    return np.abs((off + 180.0) % 360.0 - 180.0)
+
+
+def angle_between_deg(one: Array, other: Array) -> Array:
+    """Angle (...) between unit vectors (..., 3), degrees, exact for small angles too."""
+    across = np.linalg.norm(np.cross(one, other), axis=-1)
+    return np.degrees(np.arctan2(across, np.sum(np.asarray(one) * other, axis=-1)))
+
+
 def from_angles_deg(angles: Array) -> Array:
     """The inverse of `bending_angle_deg`: planar configurations (..., 3) of bending angles (...), degrees."""
     radians = np.radians(angles)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.configuration import from_poses
+from modsoft.runtime.configuration import angle_between_deg, from_poses
 from modsoft.runtime.errors import LostInRun, ModelError, ModsoftError, Tripped
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.tracker import Frame
@@ -119,7 +119,7 @@ class FrameJudge:
                 worst = int(np.argmax(over))
                 return SWAPPED, f"{_tool_name(worst)} and {_tool_name(worst + 1)}", None
         if self._used is not None and self._used_configuration is not None:
-            moved = _angle_deg(configuration, self._used_configuration)
+            moved = angle_between_deg(configuration, self._used_configuration)
             allowed = self._deg_per_s * (frame.monotonic_s - self._used.monotonic_s) + NOISE_DEG
             if np.any(moved > allowed):
                 worst = int(np.argmax(moved))
@@ -202,9 +202,3 @@ def _tool_name(tool: int) -> str:
 def _lengths_mm(frame: Frame) -> Array:
     """Distances (N,) from each tool to the next, mm."""
     return np.linalg.norm(np.diff(frame.poses[:, :3, 3], axis=0), axis=-1)
-
-
-def _angle_deg(one: Array, other: Array) -> Array:
-    """Angles (N,) between unit vectors (N, 3), degrees."""
-    across = np.linalg.norm(np.cross(one, other), axis=-1)
-    return np.degrees(np.arctan2(across, np.sum(one * other, axis=-1)))

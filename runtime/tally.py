@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime.clock import Tick
-from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.configuration import bending_error_deg
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import Judgement
 
@@ -42,8 +42,7 @@ class Tally:
         if judged.configuration is None:
             self.bad[judged.word] += 1
         else:
-            off = bending_angle_deg(judged.configuration) - bending_angle_deg(line["desired"])
-            self.error_deg.append(np.abs((off + 180.0) % 360.0 - 180.0))
+            self.error_deg.append(bending_error_deg(judged.configuration, line["desired"]))
         self.status = self._status_line(line, tick, judged)
         self._before_s = tick.start_s
 

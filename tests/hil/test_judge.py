@@ -10,7 +10,7 @@ from modsoft.hil import judge as judging
 from modsoft.hil.judge import Record, Valves, judge
 from modsoft.runtime import robot as robots
 from modsoft.runtime.actuation import channel_pressures_bar
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.configuration import bending_angle_deg, from_angles_deg
 
 TICKS = 120
 PERIOD_NS = 400_000_000
@@ -237,7 +237,7 @@ def test_tracking_has_limits_by_task_and_modules(flawless, monkeypatch):
     monkeypatch.setitem(judging.TRACKING_DEG, ("down", 3), [1.0, 2.0, 3.0])
     assert judge(flawless).word == "passed"
     off = flawless.configuration.copy()
-    off[:, 1] = from_angles_deg(judging.bending_angle_deg(flawless.desired[:, 1]) + 2.1)
+    off[:, 1] = from_angles_deg(bending_angle_deg(flawless.desired[:, 1]) + 2.1)
     plant = np.repeat(off, 20, axis=0)
     verdict = judge(
         replace(
@@ -255,8 +255,3 @@ def test_tracking_has_limits_by_task_and_modules(flawless, monkeypatch):
 def test_percentiles_are_values_that_were_measured():
     assert judging.p99(np.array([1.0, 2.0, 50.0])) == 50.0
     assert math.isnan(judging.p99(np.array([])))
-
-
-def test_small_angles_are_exact():
-    one = from_angles_deg(np.array([0.001]))
-    assert judging.angle_between_deg(one, from_angles_deg(np.array([0.0])))[0] == pytest.approx(0.001, rel=1e-9)

@@ -19,6 +19,7 @@ from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child, Rig
 from modsoft.runtime import log
 from modsoft.runtime import robot as robots
+from modsoft.runtime.configuration import angle_between_deg
 from modsoft.runtime.trajectory import load_task
 
 SCRIPTS = Path(sys.executable).parent
@@ -98,7 +99,7 @@ def test_a_model_of_three_modules_runs_robots_of_three_and_two(robot, strong_mod
     assert verdict.word == "not judged", table
     if "too slow" not in verdict.reason:
         assert all(line.ok for line in verdict.acceptances), table
-        off = judge.angle_between_deg(found.configuration, as_in_collection(found, next(tmp_path.glob("runs/*"))))
+        off = angle_between_deg(found.configuration, as_in_collection(found, next(tmp_path.glob("runs/*"))))
         print(f"off the robot of the training data, same actuation: mean {off.mean():.3f}, max {off.max():.2f}°")
         assert off.mean() < 0.3, "the rig's robot is not the one that the controller was trained on"
 

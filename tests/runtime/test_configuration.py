@@ -104,3 +104,14 @@ def test_whole_episode_equals_window_step_by_step(history, modules, steps, sizes
         rows.append(window.features(states[t + 1]))
         window.applied(actions[t])
     np.testing.assert_array_equal(c.episode_features(states, actions, history), np.stack(rows))
+
+
+def test_angles_between_vectors_are_exact_when_small():
+    one = c.from_angles_deg(np.array([0.001, 90.0]))
+    found = c.angle_between_deg(one, c.from_angles_deg(np.array([0.0, -90.0])))
+    np.testing.assert_allclose(found, [0.001, 180.0], rtol=1e-9)
+
+
+def test_bending_errors_go_the_short_way_round():
+    found = c.bending_error_deg(c.from_angles_deg(np.array([175.0, -10.0])), c.from_angles_deg(np.array([-175.0, 5.0])))
+    np.testing.assert_allclose(found, [10.0, 15.0])

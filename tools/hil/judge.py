@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.configuration import angle_between_deg, bending_error_deg
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.tally import spread
 
@@ -133,17 +133,10 @@ def p99(values: Array) -> float:
     return found["p99"] if found else math.nan
 
 
-def angle_between_deg(one: Array, other: Array) -> Array:
-    """Angle between unit vectors (..., 3), degrees, exact for small angles too."""
-    across = np.linalg.norm(np.cross(one, other), axis=-1)
-    return np.degrees(np.arctan2(across, np.sum(np.asarray(one) * other, axis=-1)))
-
-
 def tracking_error_deg(record: Record) -> Array:
     """|bending angle measured at the start of tick k - desired angle of tick k|, (K, N): the paper's convention, which
     charges the controller with the one period that every action needs to act."""
-    off = bending_angle_deg(record.configuration) - bending_angle_deg(record.desired)
-    return np.abs((off + 180.0) % 360.0 - 180.0)
+    return bending_error_deg(record.configuration, record.desired)
 
 
 def valve_difference(record: Record) -> Array:

@@ -14,12 +14,11 @@ from modsoft.hil.judge import (
     Acceptance,
     Record,
     Verdict,
-    angle_between_deg,
     measured_off_deg,
     tracking_error_deg,
     valve_difference,
 )
-from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.configuration import angle_between_deg, bending_angle_deg, bending_error_deg
 from modsoft.runtime.tally import spread
 
 CLOCKS = (
@@ -52,7 +51,7 @@ def figures(record: Record) -> dict[str, Any]:
     if len(record.tick) and len(record.plant_mono_ns) > 1:
         error, off = tracking_error_deg(record), measured_off_deg(record)
         # the state that tick k asked for is due at the start of tick k + 1
-        due = np.abs(bending_angle_deg(record.configuration[1:]) - bending_angle_deg(record.desired[:-1]))
+        due = bending_error_deg(record.configuration[1:], record.desired[:-1])
         apart = 100.0 * np.linalg.norm(record.configuration - record.desired, axis=-1)
         figure |= {
             "tracking_error_deg": _by_module(error),
