@@ -80,9 +80,10 @@ class Loop:
         # The history begins with actuation 0, so the robot is given it for one period before the first step.
         bar = channel_pressures_bar(robot, applied, CHANNELS)
         self._idle()  # arming takes a second: who asked to stop in it must not see a valve open first
+        began_ns = _ns(self.ticker.now())  # before it: no valve may be open earlier
         sequence = self.valves.set_pressures(0, bar)
         self.ticker.start(robot.loop.period_s)
-        self.log({"event": "start", "mono_ns": _ns(self.ticker.now()), "commanded_bar": bar})
+        self.log({"event": "start", "mono_ns": began_ns, "commanded_bar": bar})
         step = -1
         while True:
             tick = self.ticker.next(self._idle)

@@ -19,11 +19,12 @@ COUNTS = 4096
 ROBOT = robots.load("pneumatic-3")
 
 
-def slewed(commanded):
+def slewed(start, commanded):
     """Timer registers of a board that follows: 5 ms after the tick, one change every 10 ms at the slew limit."""
     times, rows = [], []
     applied = np.zeros(commanded.shape[1])
-    for k, target in enumerate(commanded):
+    end = START_NS + len(commanded) * PERIOD_NS
+    for k, target in enumerate([start, *commanded, np.zeros(commanded.shape[1])], -1):
         now = START_NS + k * PERIOD_NS + 5_000_000
         while not np.array_equal(applied, target):
             applied = applied + np.clip(target - applied, -0.02, 0.02)
@@ -31,9 +32,6 @@ def slewed(commanded):
             times.append(now)
             rows.append(np.round(applied / ROBOT.valve.full_scale_bar * COUNTS) / COUNTS)
             now += 10_000_000
-    end = START_NS + len(commanded) * PERIOD_NS
-    times.append(end + 1_000_000)
-    rows.append(np.zeros(commanded.shape[1]))
     return Valves(np.array(times), np.array(rows), COUNTS), end
 
 
@@ -43,7 +41,8 @@ def flawless():
     actuation = np.sin(k / 9.0)[:, None, None] * np.array([[0.2], [0.6], [-1.0]])
     commanded = np.array([channel_pressures_bar(ROBOT, a) for a in actuation])
     angles = np.sin(k / 9.0)[:, None] * np.array([3.0, 30.0, -35.0])
-    valves, end = slewed(commanded)
+    start = channel_pressures_bar(ROBOT, np.zeros((3, 1)))
+    valves, end = slewed(start, commanded)
     mono = START_NS + k * PERIOD_NS
     plant_mono = np.arange(START_NS - PERIOD_NS, end + 2 * PERIOD_NS, 20_000_000)
     plant_angles = np.stack([np.interp(plant_mono, mono, angles[:, i]) for i in range(3)], axis=-1)
@@ -51,7 +50,7 @@ def flawless():
     return Record(
         robot=ROBOT,
         task="down",
-        steps=TICKS,
+        asked=from_angles_deg(angles),
         runtime_exit=0,
         runtime_said="",
         tick=k,
@@ -62,7 +61,10 @@ def flawless():
         desired=from_angles_deg(angles),
         configuration=from_angles_deg(angles),
         frame_mono_ns=mono - 8_000_000,
+        start_ns=START_NS - PERIOD_NS,
+        start_bar=start,
         commanded_bar=commanded,
+        slew_bar_per_s=2.0,
         acknowledged_ms=np.full(TICKS, 7.5),
         faults=np.zeros(TICKS, dtype=np.int64),
         state=["RUNNING"] * TICKS,
@@ -118,16 +120,62 @@ def unsettled(record):
     )
 
 
+def told(record, from_ns, until_ns, counts, channel=0):
+    """One channel at `counts` from an instant to another, whatever else the registers say meanwhile."""
+    valves = record.valves
+    edges = [valves.between(at, at)[-1] for at in (from_ns, until_ns)]
+    mono_ns = np.concatenate([valves.mono_ns, [from_ns, until_ns]])
+    order = np.argsort(mono_ns, kind="stable")
+    duty = np.vstack([valves.duty, edges])[order]
+    mono_ns = mono_ns[order]
+    duty[(mono_ns >= from_ns) & (mono_ns < until_ns), channel] = counts / COUNTS
+    return Valves(mono_ns, duty, COUNTS)
+
+
+def slower(valves):
+    """The same registers, at half the slew: the time since a tick twice as long."""
+    since = (valves.mono_ns - START_NS) % PERIOD_NS
+    return valves._replace(mono_ns=valves.mono_ns + since)
+
+
 def late_valves(record):
     """Every change 250 ms later than commanded."""
     return record.valves._replace(mono_ns=record.valves.mono_ns + 250_000_000)
 
 
 OFF_THE_LOG = "valve outputs off the log, worst of every tick and channel"
+OUTSIDE = "valve outputs outside old and new set-point, worst of all times and channels"
+LARGEST = "largest valve output ever"
+BEFORE = "largest duty before the first set-point"
+VENTED = "valve outputs at 0 for good, after the vent began"
+P_MAX_COUNTS = 0.35 / 3 * COUNTS  # 477.9
+
+# Of the registers: each breaks the lines named with it, and no other.
+WILD = {
+    "full duty for 2 s before anything": (
+        lambda r: told(r, r.start_ns - 3_000_000_000, r.start_ns - 1_000_000_000, COUNTS), {BEFORE, LARGEST}),
+    "a count just before the first set-point": (
+        lambda r: told(r, r.start_ns - 2_000_000, r.start_ns - 1_000_000, 1), {BEFORE}),
+    "full duty for 10 ms, 12 ms after a tick": (
+        lambda r: told(r, r.mono_ns[60] + 12_000_000, r.mono_ns[60] + 22_000_000, COUNTS), {OUTSIDE, LARGEST}),
+    "the largest pressure for 10 ms, 12 ms after a tick": (
+        lambda r: told(r, r.mono_ns[60] + 12_000_000, r.mono_ns[60] + 22_000_000, 478, channel=4), {OUTSIDE}),
+    "two counts above the first set-point, on the way to it": (
+        lambda r: told(r, r.start_ns + 12_000_000, r.start_ns + 22_000_000, round(0.08 / 3 * COUNTS) + 2), {OUTSIDE}),
+    "open again for 0.9 s after the vent": (
+        lambda r: told(r, r.end_ns + 400_000_000, r.end_ns + 1_300_000_000, 300), {OUTSIDE, VENTED}),
+    "one count again after the vent": (
+        lambda r: told(r, r.end_ns + 400_000_000, r.end_ns + 401_000_000, 1), {VENTED}),
+    "one count that stays": (lambda r: other_duty(r, 1, rows=slice(-1, None)), {VENTED}),
+    "vented too late": (lambda r: told(r, r.end_ns + 1_000_000, r.end_ns + 240_000_000, 1), {VENTED}),
+}  # fmt: skip
 
 FLAWS = {
     "exit code of modsoft-runtime": lambda r: {"runtime_exit": 79},
-    "ticks": lambda r: {"steps": TICKS + 1},
+    "ticks": lambda r: {"asked": np.concatenate([r.asked, r.asked[-1:]])},
+    "desired configurations off the task's own": lambda r: {
+        "desired": changed(r.desired, (70, 1, 0), r.desired[70, 1, 0] + 2e-9)
+    },
     "missed ticks": lambda r: {"missed": 1},
     "ticks held for want of a good tracker frame": lambda r: {"held": 1},
     "lateness of a tick, 99th percentile": lambda r: {"lateness_ms": changed(r.lateness_ms, slice(0, 2), 20.0)},
@@ -143,9 +191,8 @@ FLAWS = {
     "watchdog resets": lambda r: {"board_events": [{"event": "watchdog", "mono_ns": r.mono_ns[0] - 1}]},
     "bytes dropped by the board's receiver": lambda r: {"board_dropped_bytes": 1},
     "the board's word that it vented": lambda r: {"said_vented": False},
-    "largest duty at the end": lambda r: {"valves": other_duty(r, 1, rows=slice(-1, None))},
     "highest chamber pressure at the end": lambda r: {"plant_bar": changed(r.plant_bar, (-1, 2, 1), 0.05)},
-    "ticks without time for the valves to settle": lambda r: {"end_ns": int(r.mono_ns[-1]) + 30_000_000},
+    "ticks without time for the valves to settle": lambda r: {"acknowledged_ms": changed(r.acknowledged_ms, 60, 400.0)},
     "configuration used, off the plant's own": lambda r: {
         "plant_configuration": from_angles_deg(np.full((len(r.plant_mono_ns), 3), 60.0))
     },
@@ -163,7 +210,37 @@ def test_each_flaw_breaks_its_own_line(flawless, name):
 
 def test_no_line_goes_without_a_flaw(flawless):
     tracking = {f"tracking error of module {module}, mean" for module in (1, 2, 3)}  # see below
-    assert {line.name for line in judge(flawless).acceptances} == {*FLAWS, OFF_THE_LOG, *tracking}
+    wild = {line for _, lines in WILD.values() for line in lines}
+    assert {line.name for line in judge(flawless).acceptances} == {*FLAWS, OFF_THE_LOG, *wild, *tracking}
+
+
+@pytest.mark.parametrize("name", WILD)
+def test_wild_valves_break_their_lines(flawless, name):
+    valves, lines = WILD[name]
+    verdict = judge(replace(flawless, valves=valves(flawless)))
+    assert set(broken(verdict)) == lines
+    assert verdict.word == "failed"
+
+
+def test_a_runtime_that_never_gave_a_set_point_opens_no_valve(flawless):
+    verdict = judge(replace(flawless, start_ns=None))
+    assert BEFORE in broken(verdict)
+
+
+def test_another_task_than_the_one_asked_for_fails(flawless):
+    verdict = judge(replace(flawless, asked=-flawless.asked))
+    assert broken(verdict) == ["desired configurations off the task's own"]
+    longer = judge(replace(flawless, asked=flawless.asked[:-1]))
+    assert set(broken(longer)) == {"ticks", "desired configurations off the task's own"}
+
+
+def test_a_board_slower_than_the_robot_file_has_its_time_to_settle(flawless):
+    """Its way takes twice as long as the robot file's slew says."""
+    far = np.where(np.arange(TICKS)[:, None] % 2, 0.35, 0.08) * (np.arange(12) < 6)
+    valves, end = slewed(flawless.start_bar, far)
+    half = replace(flawless, commanded_bar=far, valves=slower(valves), end_ns=end)
+    assert OFF_THE_LOG in broken(judge(half))
+    assert broken(judge(replace(half, slew_bar_per_s=1.0))) == []
 
 
 @pytest.mark.parametrize("valves", [unsettled, late_valves, lambda r: other_duty(r, 2, rows=slice(0, -1))])
@@ -173,7 +250,7 @@ def test_valves_that_do_not_follow_the_log_fail(flawless, valves):
 
 def test_a_valve_that_answers_another_channel_fails(flawless):
     duty = flawless.valves.duty[:, [1, 0, *range(2, 12)]]
-    assert broken(judge(replace(flawless, valves=flawless.valves._replace(duty=duty)))) == [OFF_THE_LOG]
+    assert set(broken(judge(replace(flawless, valves=flawless.valves._replace(duty=duty))))) == {OFF_THE_LOG, OUTSIDE}
 
 
 def test_every_tick_is_compared(flawless):
@@ -215,8 +292,11 @@ def test_a_short_run_is_not_judged(flawless):
         name: getattr(flawless, name)[:50]
         for name in "tick mono_ns lateness_ms desired configuration frame_mono_ns commanded_bar acknowledged_ms".split()
     }
-    record = replace(flawless, **short, steps=50, faults=flawless.faults[:50], state=flawless.state[:50])
-    verdict = judge(replace(record, end_ns=flawless.mono_ns[50]))
+    record = replace(
+        flawless, **short, asked=flawless.asked[:50], faults=flawless.faults[:50], state=flawless.state[:50]
+    )
+    valves, end = slewed(flawless.start_bar, flawless.commanded_bar[:50])
+    verdict = judge(replace(record, valves=valves, end_ns=end))
     assert broken(verdict) == []
     assert verdict.word == "not judged"
     assert "at least 100" in verdict.reason

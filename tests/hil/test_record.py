@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from modsoft.hil import record
+from modsoft.hil import judge, record, report
+from modsoft.runtime import robot as robots
 
 TOP = 4095
 
@@ -67,6 +68,52 @@ def test_lateness_is_that_of_the_run():
 def test_a_line_cut_by_a_kill_is_left_out(tmp_path):
     (tmp_path / "x.jsonl").write_text(json.dumps({"tick": 0}) + "\n" + '{"tick": 1, "con')
     assert record.lines(tmp_path / "x.jsonl") == [{"tick": 0}]
+
+
+def tick(number, commanded):
+    return {"tick": number, "mono_ns": 400_000_000 * number, "late_ms": 0.5, "missed": 0, "verdict": "good",
+            "frame": None,
+            "sent": commanded is not None, "desired": [[0, 0, 1]] * 3, "configuration": [[0, 0, 1]] * 3, "board": None,
+            "acknowledged": {"tick": number - 1, "ms": 7.0}, "commanded_bar": commanded}  # fmt: skip
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """A run of two ticks, the first of which sent nothing: `folder` with what the rig wrote and the runtime's log."""
+
+    def write(slew=20000, start=True):
+        run = [{"event": "start", "mono_ns": -400_000_000, "commanded_bar": [0.08] * 6 + [0] * 6}] if start else []
+        run += [tick(0, None), tick(1, [0.2] * 6 + [0] * 6)]
+        for name, events in {"run": run, "board": [READY, pwm(1, 0, 0.25)], "plant": []}.items():
+            (tmp_path / f"{name}.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
+        (tmp_path / "meta.json").write_text(json.dumps({"board": {"slew": slew} if slew else None}))
+        (tmp_path / "runtime.err").write_text("one\ntoo late\n")
+        return record.read(tmp_path, tmp_path, robots.load("pneumatic-3"), "down", np.zeros((2, 3, 3)), 79)
+
+    return write
+
+
+def test_a_first_tick_that_sent_nothing_is_a_failed_run_with_a_report(run_folder, tmp_path):
+    found = run_folder()
+    np.testing.assert_array_equal(found.commanded_bar[:, 5:7], [[0.08, 0], [0.2, 0]])
+    assert found.missed == 1
+    assert found.runtime_said == "too late"
+    verdict = judge.judge(found)
+    assert verdict.word == "failed"
+    report.write(found, verdict, {"board": "native"}, tmp_path)
+    assert "too late" in (tmp_path / "report.md").read_text()
+
+
+def test_a_run_without_a_first_set_point_has_none(run_folder):
+    found = run_folder(start=False)
+    assert found.start_ns is None
+    assert not found.commanded_bar[0].any()
+    assert judge.judge(found).word == "failed"
+
+
+@pytest.mark.parametrize(("board", "expected"), [(5000, 0.5), (20000, 2.0), (30000, 2.0), (None, 2.0)])
+def test_the_slew_is_the_slower_one(run_folder, board, expected):
+    assert run_folder(slew=board).slew_bar_per_s == expected
 
 
 def test_the_firmware_has_a_hash_on_either_board():

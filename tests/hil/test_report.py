@@ -20,7 +20,7 @@ def record():
     return Record(
         robot=robots.load("pneumatic-2"),
         task="down",
-        steps=ticks,
+        asked=from_angles_deg(angles),
         runtime_exit=0,
         runtime_said="",
         tick=np.arange(ticks),
@@ -31,6 +31,9 @@ def record():
         desired=from_angles_deg(angles),
         configuration=from_angles_deg(angles + np.array([0.5, -2.0])),
         frame_mono_ns=mono,
+        start_ns=-400_000_000,
+        start_bar=np.zeros(12),
+        slew_bar_per_s=2.0,
         commanded_bar=np.zeros((ticks, 12)),
         acknowledged_ms=np.full(ticks, 7.0),
         faults=np.zeros(ticks, dtype=np.int64),

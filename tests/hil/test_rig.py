@@ -68,12 +68,13 @@ def strong_model(tmp_path_factory, make_checkpoint):
 def run(folder, robot, model, steps):
     """A short run; every acceptance apart from its length."""
     wanted = folder / "down.npy"  # a random controller is not held to the limits of a task's name
-    np.save(wanted, load_task("down", robots.load(robot))[:steps])
+    asked = load_task("down", robots.load(robot))[:steps]
+    np.save(wanted, asked)
     with Rig(robot, folder) as rig:
         rig.run(model, str(wanted))
         rig.wait(60)
         rig.settle(1.5)
-    return record.read(folder, rig.run_folder(), rig.robot, wanted.name, steps, rig.runtime.returncode)
+    return record.read(folder, rig.run_folder(), rig.robot, wanted.name, asked, rig.runtime.returncode)
 
 
 def as_in_collection(found, run_folder):

@@ -61,7 +61,8 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     robot = load_robot(robot_file)
     desired = load_task(task, robot)
     Controller.load(model).check(robot)  # the runtime does it too; here it saves the start of the rig
-    count = min(steps or len(desired), len(desired))
+    asked = desired[:steps]
+    count = len(asked)
     build(choose(board))
 
     report.mkdir(parents=True, exist_ok=True)
@@ -77,7 +78,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
         for name in RUN_FILES:
             shutil.move(run / name, report / name)
         shutil.rmtree(rig.runs)
-    found = record.read(report, report if run else None, robot, task, count, rig.runtime.returncode)
+    found = record.read(report, report if run else None, robot, task, asked, rig.runtime.returncode)
     verdict = judge.judge(found)
     about = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),

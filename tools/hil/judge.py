@@ -1,13 +1,14 @@
 """The verdict on a run of the rig: one line for each acceptance, from the run log, the timer registers and the plant.
 
 The sources are independent of each other: what the runtime says it did (`run.jsonl`), what the emulated board's timer
-registers held (`valves.jsonl`), and where the simulated robot really was (`plant.jsonl`). Nothing here reads a clock
+registers held (`board.jsonl`), and where the simulated robot really was (`plant.jsonl`). Nothing here reads a clock
 or a file; `modsoft.hil.record` does.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ ACKNOWLEDGED_P99_MS = 30.0
 VALVE_COUNTS = 1.0  # of the timer: a set-point is rounded to counts once
 DROPPED_BYTES = 0
 CHAMBERS_AT_END_BAR = 0.02
+DESIRED_OFF = 1e-9  # of a component: the log rounds to nine digits
 MEASURED_OFF_DEG = 1.0  # the tracker rounds, and its frame is up to 40 ms old while the robot moves
 # Mean tracking error of each module, degrees, by task and number of modules: about twice what four minutes of training
 # on three modules were measured to reach: down 0.05 1.03 1.88 and 0.95 1.81, edge 0.10 0.58 3.11 and 0.74 2.51.
@@ -45,6 +47,7 @@ TRACKING_DEG: dict[tuple[str, int], list[float]] = {
 BOARD_LATE_MS = 100.0
 BOARD_SLIPPED_PERCENT = 0.5  # of the run, in stalls
 PLANT_LATE_MS = 100.0
+FOR_EVER_NS = 1 << 62
 SETTLING_S = 0.03  # after acknowledgement and slew: some loops of the firmware; the board's lateness comes on top
 
 
@@ -69,7 +72,7 @@ class Record:
 
     robot: Robot
     task: str
-    steps: int  # that the run should have
+    asked: Array  # (steps, N, 3) desired configurations of the task, by the rig's own reading of it
     runtime_exit: int
     runtime_said: str  # its last line, for a run that failed
     tick: NDArray[np.int64]  # (K,)
@@ -80,7 +83,10 @@ class Record:
     desired: Array  # (K, N, 3)
     configuration: Array  # (K, N, 3), NaN where no frame was good
     frame_mono_ns: NDArray[np.int64]  # (K,) when the frame used came in
+    start_ns: int | None  # just before the first set-point; None: the runtime never gave one
+    start_bar: Array  # (channels,) that set-point, in force until the first tick
     commanded_bar: Array  # (K, channels)
+    slew_bar_per_s: float  # of the board, or the robot file's where that is slower
     acknowledged_ms: Array  # (K,), NaN where none came
     faults: NDArray[np.int64]  # (K,)
     state: list[str]  # (K,) the board's
@@ -96,6 +102,11 @@ class Record:
     plant_configuration: Array  # (M, N, 3)
     plant_bar: Array  # (M, N, 2)
     plant_late_ms: Array  # of the slices in the run
+
+    @property
+    def steps(self) -> int:
+        """Ticks that the run should have."""
+        return len(self.asked)
 
 
 class Acceptance(NamedTuple):
@@ -139,28 +150,96 @@ def tracking_error_deg(record: Record) -> Array:
     return bending_error_deg(record.configuration, record.desired)
 
 
-def valve_difference(record: Record) -> Array:
-    """Largest difference (K,) of timer registers from what the log says was commanded, in counts, over all channels
-    and all the time from when the slew must have settled until the next tick starts. NaN: no such time."""
+class Span(NamedTuple):
+    """A set-point in force, and the one before it, in counts of every channel that the board has. It is taken at some
+    time after `from_ns` and reached by `settled_ns`."""
+
+    before: Array
+    commanded: Array
+    from_ns: int
+    settled_ns: int
+    until_ns: int
+
+
+def spans(record: Record) -> Iterator[Span]:
+    """Every set-point: the first one, those of the ticks, and at last the vent, which is a set-point of 0 for ever."""
+    if record.start_ns is None:
+        return
+    channels = record.valves.duty.shape[1]
+    scale = full_counts_per_bar(record)
+    set_points_bar = [record.start_bar[:channels], *record.commanded_bar[:, :channels], np.zeros(channels)]
+    begins_ns = [record.start_ns, *(int(at) for at in record.mono_ns), record.end_ns, FOR_EVER_NS]
+    took_ms = [ACKNOWLEDGED_P99_MS, *np.nan_to_num(record.acknowledged_ms, nan=ACKNOWLEDGED_P99_MS)]
+    took_ms.append(ACKNOWLEDGED_P99_MS)
+    before = np.zeros(channels)
+    for k, commanded in enumerate(set_points_bar):
+        slew_s = float(np.max(np.abs(commanded - before))) / record.slew_bar_per_s
+        settling_s = took_ms[k] * 1e-3 + slew_s + SETTLING_S + np.nan_to_num(record.board_late_ms) * 1e-3
+        settled_ns = begins_ns[k] + round(settling_s * 1e9)
+        yield Span(before * scale, commanded * scale, begins_ns[k], settled_ns, begins_ns[k + 1])
+        before = commanded
+
+
+def full_counts_per_bar(record: Record) -> float:
     assert record.robot.valve is not None  # the rig runs no other robots
-    scale = record.valves.counts / record.robot.valve.full_scale_bar
+    return record.valves.counts / record.robot.valve.full_scale_bar
+
+
+def valve_difference(record: Record) -> Array:
+    """Largest difference (K + 1,) of timer registers from what the log says was commanded, in counts, over all channels
+    and all the time from when the slew must have settled until the next tick starts; the first is that of the set-point
+    before the first tick. NaN: no such time."""
     channels = record.valves.duty.shape[1]
     if record.commanded_bar[:, channels:].any():
-        return np.full(len(record.tick), np.inf)  # a set-point for a channel that the board does not have
-    worst = np.full(len(record.tick), np.nan)
-    late_s = np.nan_to_num(record.board_late_ms) * 1e-3
-    before = np.zeros(channels)
-    for k, commanded in enumerate(record.commanded_bar[:, :channels]):
-        slew_s = np.max(np.abs(commanded - before)) / record.robot.limits.slew_bar_per_s
-        acknowledged_s = np.nan_to_num(record.acknowledged_ms[k], nan=ACKNOWLEDGED_P99_MS) * 1e-3
-        settling_s = acknowledged_s + slew_s + SETTLING_S + late_s
-        settled_ns = record.mono_ns[k] + round(settling_s * 1e9)
-        until_ns = record.mono_ns[k + 1] if k + 1 < len(record.tick) else record.end_ns
-        if settled_ns <= until_ns:
-            stood = record.valves.between(settled_ns, until_ns)
-            worst[k] = np.max(np.abs(stood * record.valves.counts - commanded * scale))
-        before = commanded
-    return worst
+        return np.full(len(record.tick) + 1, np.inf)  # a set-point for a channel that the board does not have
+    worst = []
+    for span in list(spans(record))[:-1]:  # the vent has its own line
+        worst.append(math.nan)
+        if span.settled_ns <= span.until_ns:
+            stood = record.valves.between(span.settled_ns, span.until_ns) * record.valves.counts
+            worst[-1] = float(np.max(np.abs(stood - span.commanded)))
+    return np.array(worst)
+
+
+def valve_excursion(record: Record) -> Array:
+    """Largest distance (K + 2,) of any timer register, at any time, from the range between the set-point in force and
+    the one before it, in counts; the last is that of the vent."""
+    worst = []
+    for span in spans(record):
+        stood = record.valves.between(span.from_ns, span.until_ns) * record.valves.counts
+        low, high = np.minimum(span.before, span.commanded), np.maximum(span.before, span.commanded)
+        worst.append(np.max(np.maximum(low - stood, stood - high), initial=0.0))
+    return np.array(worst)
+
+
+def largest_duty_before(record: Record) -> float:
+    """Of all channels, until the runtime gave its first set-point; ever, where it gave none."""
+    until_ns = FOR_EVER_NS if record.start_ns is None else record.start_ns
+    return float(np.max(record.valves.between(-FOR_EVER_NS, until_ns)))
+
+
+def vented_after_ms(record: Record) -> float:
+    """From the beginning of the vent until every timer register is at 0 for good; infinite where one never is."""
+    told = np.flatnonzero(record.valves.duty.any(axis=1))
+    if not len(told):
+        return 0.0
+    if told[-1] + 1 == len(record.valves.duty):
+        return math.inf
+    return max(0.0, float(record.valves.mono_ns[told[-1] + 1] - record.end_ns) * 1e-6)
+
+
+def vent_limit_ms(record: Record) -> float:
+    """The way from the largest pressure down, at the board's slew, after a request as slow as an acknowledgement."""
+    assert record.robot.valve is not None
+    way_s = record.robot.valve.p_max_bar / record.slew_bar_per_s
+    return ACKNOWLEDGED_P99_MS + (way_s + SETTLING_S) * 1e3 + float(np.nan_to_num(record.board_late_ms))
+
+
+def desired_off(record: Record) -> float:
+    """Largest difference of a component of the logged desired configurations from the task's own, by tick."""
+    if np.any(record.tick >= record.steps):
+        return math.inf
+    return _worst(np.abs(record.desired - record.asked[record.tick]))
 
 
 def measured_off_deg(record: Record) -> Array:
@@ -188,6 +267,8 @@ def acceptances(record: Record) -> list[Acceptance]:
     unacknowledged = int(np.isnan(record.acknowledged_ms).sum())
     acknowledged = record.acknowledged_ms[~np.isnan(record.acknowledged_ms)]
     differences = valve_difference(record)
+    highest = float(np.max(record.valves.duty, initial=0.0)) * record.valves.counts
+    allowed = round(record.robot.valve.p_max_bar * full_counts_per_bar(record), 2) if record.robot.valve else 0.0
     running = [event for event in record.board_events if count and event["mono_ns"] >= record.mono_ns[0]]
     watchdogs = sum(event["event"] == "watchdog" for event in record.board_events)
     faulty = [f"0x{value:04x}" for value in np.unique(record.faults[record.faults != 0])]
@@ -195,6 +276,7 @@ def acceptances(record: Record) -> list[Acceptance]:
     lines = [
         Acceptance("exit code of modsoft-runtime", str(record.runtime_exit), "0", record.runtime_exit == 0),
         Acceptance("ticks", str(count), str(record.steps), count == record.steps),
+        at_most("desired configurations off the task's own", desired_off(record), DESIRED_OFF),
         at_most("missed ticks", record.missed, MISSED_TICKS, timing=True),
         at_most("ticks held for want of a good tracker frame", record.held, HELD_TICKS, timing=True),
         Acceptance(
@@ -209,6 +291,10 @@ def acceptances(record: Record) -> list[Acceptance]:
                 " ms", timing=True),
         at_most("valve outputs off the log, worst of every tick and channel", _worst(differences), VALVE_COUNTS,
                 " counts"),
+        at_most("valve outputs outside old and new set-point, worst of all times and channels",
+                _worst(valve_excursion(record)), VALVE_COUNTS, " counts"),
+        at_most("largest valve output ever", highest, allowed + VALVE_COUNTS, " counts"),
+        at_most("largest duty before the first set-point", largest_duty_before(record), 0.0),
         at_most("ticks without time for the valves to settle", int(np.isnan(differences).sum()), 0),
         Acceptance("faults of the board", ", ".join(faulty) or "none", "none", not faulty),
         at_most("ticks that the board did not follow", len(not_running), 0),
@@ -218,8 +304,8 @@ def acceptances(record: Record) -> list[Acceptance]:
         Acceptance(
             "the board's word that it vented", "yes" if record.said_vented else "no", "yes", record.said_vented
         ),
-        at_most("largest duty at the end", float(np.max(record.valves.duty[-1], initial=0.0))
-                if len(record.valves.duty) else math.nan, 0.0),
+        at_most("valve outputs at 0 for good, after the vent began", vented_after_ms(record), vent_limit_ms(record),
+                " ms"),
         at_most("highest chamber pressure at the end", float(np.max(record.plant_bar[-1]))
                 if len(record.plant_bar) else math.nan, CHAMBERS_AT_END_BAR, " bar"),
     ]  # fmt: skip

@@ -13,6 +13,7 @@ import numpy as np
 from modsoft.hil.emulator import FIRMWARE, FIRMWARE_ELF
 from modsoft.hil.judge import Record, Valves
 from modsoft.runtime import log
+from modsoft.runtime.protocol import CHANNELS, to_bar
 from modsoft.runtime.robot import Robot
 
 Line = dict[str, Any]
@@ -20,14 +21,20 @@ Line = dict[str, Any]
 LATE_BOUND_MS = 20.0  # board.c: emulated time never falls further behind, it gives way and says `late`
 
 
-def read(folder: Path, run: Path | None, robot: Robot, task: str, steps: int, runtime_exit: int) -> Record:
-    """The record of a run from the rig's `folder` and from the runtime's own, `run` (None: it never made one)."""
+def read(folder: Path, run: Path | None, robot: Robot, task: str, asked: np.ndarray, runtime_exit: int) -> Record:
+    """The record of a run from the rig's `folder` and from the runtime's own, `run` (None: it never made one).
+
+    `asked` (steps, N, 3): the desired configurations that the run was to follow.
+    """
     events = lines(folder / "board.jsonl")
     plant = lines(folder / "plant.jsonl")
     ticks: list[Line] = []
     told: list[Line] = []
+    meta: Line = {}
     if run is not None:
-        _, ticks, told = log.read(run)
+        meta, ticks, told = log.read(run)
+    start = next((event for event in told if event["event"] == "start"), None)
+    start_bar = start["commanded_bar"] if start else [0.0] * CHANNELS
     end = next((event for event in told if event["event"] == "end"), None)
     start_ns = ticks[0]["mono_ns"] if ticks else math.inf
     end_ns = end["mono_ns"] if end else ticks[-1]["mono_ns"] if ticks else -1
@@ -37,7 +44,7 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, steps: int, ru
     return Record(
         robot=robot,
         task=task,
-        steps=steps,
+        asked=asked,
         runtime_exit=runtime_exit,
         runtime_said=said[-1] if said else "",
         tick=_column(ticks, "tick", np.int64),
@@ -50,7 +57,10 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, steps: int, ru
             [tick["configuration"] or np.full((modules, 3), np.nan) for tick in ticks], dtype=np.float64
         ).reshape(count, modules, 3),
         frame_mono_ns=np.array([tick["frame"]["mono_ns"] if tick["frame"] else -1 for tick in ticks], dtype=np.int64),
-        commanded_bar=_commanded(ticks),
+        start_ns=start["mono_ns"] if start else None,
+        start_bar=np.array(start_bar),
+        commanded_bar=_commanded(ticks, start_bar),
+        slew_bar_per_s=_slew_bar_per_s(robot, meta),
         acknowledged_ms=np.array([_number(tick["acknowledged"]["ms"]) for tick in ticks]),
         faults=np.array([tick["board"]["faults"] if tick["board"] else 0 for tick in ticks], dtype=np.int64),
         state=[tick["board"]["state"] if tick["board"] else "unknown" for tick in ticks],
@@ -73,12 +83,19 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def _commanded(ticks: list[Line]) -> np.ndarray:
-    """Set-points (K, channels) in force after each tick: those of the tick before where nothing was sent."""
-    rows: list[list[float]] = []
+def _commanded(ticks: list[Line], start_bar: list[float]) -> np.ndarray:
+    """Set-points (K, channels) in force after each tick: those before it where nothing was sent."""
+    rows = [start_bar]
     for tick in ticks:
         rows.append(tick["commanded_bar"] or rows[-1])
-    return np.array(rows, dtype=np.float64).reshape(len(ticks), -1 if rows else 0)
+    return np.array(rows[1:], dtype=np.float64).reshape(len(ticks), len(start_bar))
+
+
+def _slew_bar_per_s(robot: Robot, meta: Line) -> float:
+    """Fastest change of a valve output: the robot file only says what is allowed, the board may be slower."""
+    board = meta.get("board")
+    slew_bar_per_s = robot.limits.slew_bar_per_s
+    return min(slew_bar_per_s, to_bar(board["slew"])) if board else slew_bar_per_s
 
 
 def _board_lateness(events: list[Line], summary: Line, start_ns: float, end_ns: int) -> Line:
