@@ -8,13 +8,14 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from modsoft.hil import judge, record
+from modsoft.hil import emulator, judge, record
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child, Rig
 from modsoft.runtime import log
@@ -164,6 +165,41 @@ def test_nothing_outlives_the_rig(number, code, model_file, tmp_path):
         duties = record.valves(record.lines(tmp_path / "board.jsonl")).duty
         assert duties.any()
         assert not duties[-1].any(), "the runtime is given the time to vent"
+
+
+def test_a_process_that_hangs_with_a_full_pipe_is_ended(tmp_path, monkeypatch):
+    (tmp_path / "deaf.py").write_text("import time\ntime.sleep(60)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(emulator, "STOP_TIMEOUT_S", 0.2)
+    child = Child("deaf", [], lambda line: None)
+    sender = threading.Thread(target=child.send, args=({"poses": "x" * 1_000_000},), daemon=True)
+    sender.start()
+    wait_until(child._sending.locked, 5)
+    stopper = threading.Thread(target=child.stop, daemon=True)
+    stopper.start()
+    stopper.join(10)
+    try:
+        assert not stopper.is_alive()
+        assert child.process.poll() == -signal.SIGKILL
+    finally:
+        child.process.kill()
+    sender.join(5)
+    assert not sender.is_alive()
+    child.stop()  # a second time does no harm
+
+
+@pytest.mark.realtime
+def test_a_hanging_tracker_or_robot_does_not_keep_the_rig(tmp_path, monkeypatch):
+    monkeypatch.setattr(emulator, "STOP_TIMEOUT_S", 0.3)
+    with Rig("pneumatic-3", tmp_path, board="native") as rig:
+        below = descendants(os.getpid())
+        for child in (rig.tracker, rig.plant):
+            child.process.send_signal(signal.SIGSTOP)
+        for child in (rig.tracker, rig.plant):
+            threading.Thread(target=child.send, args=({"duty": "x" * 1_000_000},), daemon=True).start()
+            wait_until(child._sending.locked, 5)
+    assert len(below) >= 3
+    assert not [pid for pid in below if alive(pid)]
 
 
 @pytest.mark.realtime

@@ -9,6 +9,7 @@ simavr is GPL-3; what is linked with it here is a test tool, is built on the spo
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import shutil
 import subprocess
@@ -117,6 +118,27 @@ def _run(command: tuple[str, ...], complaint: str) -> None:
 def is_event(name: str, **values: Any) -> Callable[[Event], bool]:
     """A predicate for `EmulatedBoard.wait_for`: events of this name with these values."""
     return lambda event: event["event"] == name and all(event.get(key) == value for key, value in values.items())
+
+
+def end(process: subprocess.Popen[bytes], sending: threading.Lock) -> None:
+    """End a process by the end of its input, or by force. `sending` is held by whoever writes to it.
+
+    One that hangs with a full pipe blocks its writer, who keeps the lock: that one is killed without it.
+    """
+    assert process.stdin is not None
+    if sending.acquire(timeout=STOP_TIMEOUT_S):
+        try:
+            with contextlib.suppress(BrokenPipeError):  # of what was not written yet
+                process.stdin.close()
+        finally:
+            sending.release()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(STOP_TIMEOUT_S)
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+    with sending, contextlib.suppress(BrokenPipeError):
+        process.stdin.close()
 
 
 class EmulatedBoard:
@@ -241,15 +263,7 @@ class EmulatedBoard:
         process, self._process = self._process, None
         if process is None or process.stdin is None or process.stdout is None:
             return self.summary
-        try:
-            process.stdin.close()  # end of file: the same way as when this process dies
-        except BrokenPipeError:
-            pass
-        try:
-            process.wait(STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        end(process, self._sending)  # end of file: the same way as when this process dies
         self._reader.join()
         process.stdout.close()
         self._stderr.seek(0)

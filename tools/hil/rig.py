@@ -24,7 +24,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, cast
 
-from modsoft.hil.emulator import EmulatedBoard
+from modsoft.hil.emulator import EmulatedBoard, end
 from modsoft.hil.plant import load_robot
 from modsoft.hil.polaris import write_tool_files
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, UsageError
@@ -32,7 +32,6 @@ from modsoft.runtime.errors import DeviceAbsent, LostInRun, UsageError
 Line = dict[str, Any]
 
 START_TIMEOUT_S = 60.0  # the first start compiles the simulator
-STOP_TIMEOUT_S = 3.0
 RUNTIME_STOP_TIMEOUT_S = 5.0  # it vents and waits for the board's word
 FORWARD_PERIOD_S = 0.004  # a slewing board changes its duties every millisecond; the plant needs them every 20
 SENSED_CHANNELS = 8  # A0 to A7
@@ -85,14 +84,8 @@ class Child:
         return lines[-1] if lines else f"exit code {self.process.poll()}"
 
     def stop(self) -> None:
-        """Ends the process: at the end of its input, or else by force."""
-        with contextlib.suppress(BrokenPipeError), self._sending:
-            self._input.close()
-        try:
-            self.process.wait(STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        """Ends the process: at the end of its input, or else by force. Twice does no harm."""
+        end(self.process, self._sending)
         self._reader.join()
         self._output.close()
         self._stderr.close()
@@ -141,14 +134,16 @@ class Rig:
             exits.callback(self.tracker.stop)
             self.tracker.wait_ready()
             self.plant = Child("modsoft.hil.plant", ["--robot", self._robot_file], self._plant_state)
-            exits.callback(self.plant.stop)
-            self.plant.wait_ready()
-            exits.callback(self.board.stop)
-            self.board.start()
+            # Whoever only passes lines on may be held up by a process that hangs: the one that takes them ends first.
             forwarder = threading.Thread(target=self._forward_duties, name="duties", daemon=True)
-            forwarder.start()
-            exits.callback(forwarder.join)
+            exits.callback(lambda: forwarder.join() if forwarder.ident else None)
+            exits.callback(self.plant.stop)
+            exits.callback(self.board.stop)
+            exits.callback(self.tracker.stop)
             exits.callback(self._closing.set)
+            self.plant.wait_ready()
+            self.board.start()
+            forwarder.start()
             self._exits = exits.pop_all()
         return self
 
