@@ -47,25 +47,29 @@ class Stage:
         return self.makes.with_name(f".{self.makes.name}.made-from")
 
 
+# What the data, the network and the artefact have in common: features, state, and what an action means.
+SHARED = [f"runtime/{name}.py" for name in ("configuration", "actuation", "robot")]
 STAGES = [
     Stage(
         "collect data from the simulated three-module robot",
         ["modsoft-collect", "--robot", ROBOT, "--samples", "15000", "--strategy", "staged", "--out", str(DATA)],
         DATA,
-        [f"runtime/robots/{ROBOT}.toml", "training/fleet*.[ch]"]
-        + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "collect")],
+        [f"runtime/robots/{ROBOT}.toml", "training/fleet*.[ch]", *SHARED]
+        + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "collect")]
+        + [f"training/{name}.py" for name in ("dataset", "shards", "backends")],
     ),
     Stage(
         "train the biLSTM controller",
         ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--minutes", "3.5"],
         CHECKPOINT,
-        [str(DATA)] + [f"training/{name}.py" for name in ("train", "dataset", "networks")],
+        [str(DATA)] + [f"training/{name}.py" for name in ("train", "dataset", "networks", "checkpoint")] + SHARED,
     ),
     Stage(
         "export it and compare it with torch",
         ["modsoft-export", str(CHECKPOINT), "--out", str(MODEL)],
         MODEL,
-        [str(CHECKPOINT), "export/*.py", "runtime/artefact.py", "runtime/controller.py"],
+        [str(CHECKPOINT), "export/*.py", "runtime/artefact.py", "runtime/controller.py", *SHARED]
+        + [f"training/{name}.py" for name in ("networks", "checkpoint")],
     ),
 ]
 RUN = [

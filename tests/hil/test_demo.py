@@ -1,5 +1,6 @@
 """`make demo`: what is made again and what is not, and the short report."""
 
+import ast
 import importlib.util
 from pathlib import Path
 
@@ -91,6 +92,32 @@ def test_the_stages_hang_together(demo):
     assert str(demo.STAGES[-1].makes) in demo.RUN
     for pattern in [pattern for each in demo.STAGES for pattern in each.depends_on]:
         assert pattern.startswith("demo/") or list(ROOT.glob(pattern)), pattern
+
+
+# What a stage runs, and what of that shapes no result: messages, the command line, who works where.
+ENTRIES = {"modsoft-collect": "training/collect.py", "modsoft-train": "training/train.py",
+           "modsoft-export": "export/write.py"}  # fmt: skip
+SHAPELESS = {"runtime/errors.py", "runtime/command.py", "training/workers.py", "training/coverage.py"}
+
+
+def imported(path, found):
+    """Files of the project that `path` imports, wherever in it, and those that they import."""
+    found.add(str(path))
+    for node in ast.walk(ast.parse((ROOT / path).read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("modsoft."):
+            folder = Path(*node.module.split(".")[1:])
+            names = [folder.with_suffix(".py"), *(folder / f"{alias.name}.py" for alias in node.names)]
+            for name in names:
+                if (ROOT / name).is_file() and str(name) not in found | SHAPELESS:
+                    imported(name, found)
+    return found
+
+
+def test_a_stage_depends_on_all_code_that_it_runs(demo):
+    for each in demo.STAGES:
+        named = {str(path.relative_to(ROOT)) for pattern in each.depends_on for path in ROOT.glob(pattern)}
+        needed = imported(Path(ENTRIES[each.command[0]]), set())
+        assert needed - named == set(), each.title
 
 
 def test_the_short_report_says_what_is_asked(demo):
