@@ -134,6 +134,8 @@ class Keys:
         import termios  # neither exists on Windows
         import tty
 
+        if sys.stdin is None:  # closed by whoever started the program
+            return None
         try:
             terminal = sys.stdin.fileno()
             if not os.isatty(terminal) or os.tcgetpgrp(terminal) != os.getpgrp():
@@ -167,7 +169,7 @@ class Keys:
     def _windows(self) -> Callable[[], str] | None:
         import msvcrt  # exists on Windows only
 
-        if not sys.stdin.isatty():
+        if sys.stdin is None or not sys.stdin.isatty():
             return None
 
         def read() -> str:

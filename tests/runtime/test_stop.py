@@ -66,6 +66,14 @@ def test_keys_do_nothing_without_a_terminal(monkeypatch):
     assert stop.error is None
 
 
+def test_keys_and_status_line_do_without_closed_streams(monkeypatch):
+    monkeypatch.setattr("sys.stdin", None)
+    stop = Stop()
+    with Keys(stop), StatusLine(lambda: "one", None):
+        stop.wait(0)
+    assert stop.error is None
+
+
 @pytest.fixture
 def terminal(monkeypatch):
     """A pseudo-terminal as standard input, ours to read from."""
