@@ -81,7 +81,7 @@ class Loop:
         bar = channel_pressures_bar(robot, applied, CHANNELS)
         self._idle()  # arming takes a second: who asked to stop in it must not see a valve open first
         began_ns = _ns(self.ticker.now())  # before it: no valve may be open earlier
-        sequence = self.valves.set_pressures(0, bar)
+        sequence: int | None = self.valves.set_pressures(0, bar)
         self.ticker.start(robot.loop.period_s)
         self.log({"event": "start", "mono_ns": began_ns, "commanded_bar": bar})
         step = -1
@@ -118,6 +118,7 @@ class Loop:
                     line |= {"sent": True, "actuation": applied, "commanded_bar": bar}
                     guard.on_time()
                 else:
+                    sequence = None  # the acknowledgement of the step before is not this one's
                     self.valves.beat(step + 1)
                     guard.missed(1)
                 window.applied(applied)
@@ -138,12 +139,12 @@ class Loop:
         if frame is not None and self.ticker.now() - frame.monotonic_s > silence_s:
             raise LostInRun(f"tracker: no new frame for {silence_s:.1f} s; look at the tracker, then start again")
 
-    def _acknowledged(self, step: int, sequence: int) -> dict[str, Any]:
-        """Whether the board has the set-points of `step`, and how long it took to say so."""
+    def _acknowledged(self, step: int, sequence: int | None) -> dict[str, Any]:
+        """Whether the board has the set-points of `step` (None: it had none), and how long it took to say so."""
         status, latency_s = self.valves.status, self.valves.ack_latency_s
         known = status is not None and status.acked_seq == sequence and latency_s is not None
         told = {"tick": step, "ms": latency_s * 1e3 if known and latency_s is not None else None}
-        if step >= 0 and status is not None:
+        if step >= 0 and status is not None and sequence is not None:
             self.tally.acknowledged(told["ms"])
         return told
 

@@ -367,6 +367,37 @@ def test_a_long_stall_ends_the_run(missed):
         world.run()
 
 
+def test_a_step_that_sent_nothing_has_no_acknowledgement():
+    """The board still tells that of the set-point before, which must not be taken for this step's."""
+    world = World(steps=6)
+
+    def slow(features):
+        world.time_s += 0.25 if len(world.features) == 4 else 0.0
+        return np.full((3, 1), 0.1)
+
+    world.answer = slow
+    world.run()
+    assert [line["sent"] for line in world.ticks] == [True] * 3 + [False] + [True] * 2
+    told = {line["acknowledged"]["tick"]: line["acknowledged"]["ms"] for line in world.lines if "acknowledged" in line}
+    assert told[3] is None
+    assert told[2] == told[4] == pytest.approx(7.0)
+    assert world.tally.acknowledged_ms == pytest.approx([7.0] * 5)
+
+
+def test_the_first_set_point_is_not_older_than_the_start():
+    world = World(steps=2)
+    give = world.set_pressures
+
+    def slowly(tick, pressures_bar):
+        world.time_s += 0.004
+        return give(tick, pressures_bar)
+
+    world.set_pressures = slowly
+    world.run()
+    [start] = [line for line in world.lines if line.get("event") == "start"]
+    assert start["mono_ns"] * 1e-9 == pytest.approx(world.sent[0][0] - 0.004)
+
+
 def test_acknowledgements_belong_to_the_step_before():
     world = World(steps=6)
     world.at[2] = lambda: setattr(world, "acknowledging", False)
