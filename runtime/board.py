@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, Tripped
 from modsoft.runtime.fit import check_board
-from modsoft.runtime.link import HELLO_WAIT_S, RESETS, Link, Phase, fault_names, refusal
+from modsoft.runtime.link import HELLO_WAIT_S, RESETS, STATUS_SILENCE_S, Link, Phase, fault_names, refusal
 from modsoft.runtime.ports import READ_WAIT_S, open_port
 from modsoft.runtime.protocol import (
     CHANNELS,
@@ -41,6 +41,8 @@ GONE_HOST = Fault.LINK_TIMEOUT | Fault.CONTROL_TIMEOUT
 VENT_WAIT_S = 3.0
 LOST_VENT_WAIT_S = 6.0  # a board in its bootloader needs up to 5 s of silence to come back
 CLEAR_WAIT_S = 1.0
+DOWN_BAR = 0.05  # P_DOWN of firmware/limits.h: above it a chamber is not empty
+DOWN_WAIT_S = 1.0  # for the air to leave, after the valves are at 0
 
 
 class Port(Protocol):
@@ -179,7 +181,7 @@ class Board:
             self._wait(lambda: not self._link.busy, deadline)
             self.check()
             status = self.status
-            if status is not None and status.state == State.ARMED:
+            if status is not None and status.state == State.ARMED and self._link.armed:
                 self._p_max = self.hello.p_max
                 return
             nack = self._link.refused
@@ -234,6 +236,18 @@ class Board:
 
     def _said_vented(self, since: float) -> bool:
         return self._link.vented and self._link.status_at >= since and not self._link.busy
+
+    def still_pressed(self) -> dict[int, float]:
+        """Channels whose sensor still measures pressure about a second after the venting, with that pressure, bar.
+
+        Returns as soon as there is none; also where the board's word is too old to tell.
+        """
+        self._wait(lambda: not self._pressed(), self._clock() + DOWN_WAIT_S)
+        return {} if self._closed or self.status_age_s > STATUS_SILENCE_S else self._pressed()
+
+    def _pressed(self) -> dict[int, float]:
+        measured_bar = self.measured_bar
+        return {int(channel): float(measured_bar[channel]) for channel in np.flatnonzero(measured_bar >= DOWN_BAR)}
 
     def clear_fault(self, mask: int | None = None) -> bool:
         """Clear exactly these faults (None: all that are latched); True when the board did. It refuses while a sensor

@@ -85,6 +85,7 @@ class Link:
         self.counts = dict.fromkeys(("bytes", "bad_frames", "refused", "sets", "missed_acks"), 0)  # for the log
         self.tick = 0
         self.session = 0
+        self.armed = False  # the board opened the session that was asked for last
         self.heartbeats_since: float | None = None
 
         self._parser = Parser()
@@ -113,6 +114,7 @@ class Link:
         """Ask for a new session that drives the channels of this mask; READY only."""
         assert self.hello is not None
         self.refused = None
+        self.armed = False
         session = self._board_session % 255 + 1
         self._request = _Request(Arm(PROTOCOL_HASH, self.hello.boot_id, session, channels, p_full), RETRIES)
 
@@ -210,6 +212,7 @@ class Link:
             done = board_session == message.new_session and status.state in (State.ARMED, State.RUNNING)
             if done:
                 self.session = message.new_session
+                self.armed = True
         elif isinstance(message, Vent):
             done = status.state not in (State.ARMED, State.RUNNING)
             if message.mode == VentMode.DUMP:

@@ -34,6 +34,7 @@ from modsoft.runtime.errors import (
     ModelError,
     ModsoftError,
     RobotFileError,
+    Tripped,
     UsageError,
 )
 from modsoft.runtime.loop import Loop
@@ -136,19 +137,28 @@ def run(options: Options) -> None:
 def finish(board: Board | None, log: logs.RunLog, tally: Tally, slot: Slot, error: BaseException | None) -> None:
     """Vents, closes the log, says what came of the run, and raises what ended it, if anything did."""
     began_ns = time.monotonic_ns()
-    vented = False
+    vented, pressed = False, dict[int, float]()
     if board is not None:
         try:
             vented = board.vent(VentMode.DUMP if isinstance(error, StopKey) else VentMode.RAMP)
+            pressed = board.still_pressed() if vented else {}
         except Exception as failed:  # noqa: BLE001 - the log must still be closed; the board's own timer vents
             error = error or failed
         if not vented and error is None:
             error = LostInRun("the task was done, but the board never said that it is vented; look at the pressures")
+    if pressed:
+        found = ", ".join(f"channel {channel} still measures {bar:.2f} bar" for channel, bar in pressed.items())
+        before = f" (the run ended before that: {str(error) or type(error).__name__})" if error is not None else ""
+        advice = "shut off the air, then look at that valve and its sensor"
+        stuck = Tripped(f"the valves are commanded to 0, but {found}: {advice}{before}")
+        stuck.__cause__ = error
+        error = stuck
     code, reason = 0, "done"
     if error is not None:
         code = error.exit_code if isinstance(error, ModsoftError) else INTERNAL_EXIT_CODE
         reason = str(error) or type(error).__name__
-    log.put({"event": "end", "mono_ns": began_ns, "exit_code": code, "reason": reason, "vented": vented})
+    log.put({"event": "end", "mono_ns": began_ns, "exit_code": code, "reason": reason, "vented": vented,
+             "still_bar": pressed})  # fmt: skip
     figures = {"figures": tally.figures(), "tracker": dict(slot.counts), "vented": vented}
     log.close(code, reason, {**figures, "link": None if board is None else board.statistics})
     if board is None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from modsoft.runtime import protocol, robot
-from modsoft.runtime.board import Board
+from modsoft.runtime.board import DOWN_BAR, Board
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, RobotFileError, Tripped
 from modsoft.runtime.protocol import Fault, State, VentMode
 
+ROOT = Path(__file__).resolve().parents[2]
 BOOT_MS = 840  # the bootloader's window after a reset, as measured on the emulated MEGA
 BOOTLOADER_MS = 4800  # how long it stays once it has heard something
 
@@ -435,17 +439,71 @@ def test_board_reset_in_mid_run(rig):
     board.arm(ROBOT)
     run(board, port, 2)
     port.reset()
-    reset_at, sent = port.now_ms, len(port.written)
+    reset_at = port.now_ms
     while board.lost is None:
         board._pump()
     assert port.now_ms - reset_at <= 1200
-    talked = port.written[sent:]
-    assert all(protocol.message_id(protocol.Set) not in data[2:3] for _, data in talked)
+    with pytest.raises(LostInRun):
+        board.set_pressures(99, HALF)
+    run_pumps(board, 10)
     sent = len(port.written)
     assert board.vent()
     assert len(port.written) == sent
     assert port.now_ms - reset_at <= 6000
     assert port.board.state == State.IDLE
+
+
+def test_a_set_point_that_waits_while_the_board_restarts_is_never_sent(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    tick = run(board, port, 1)
+    sets = port.count(protocol.Set)
+    port.reset()
+    port.boots_at = port.now_ms + 5
+    port.run(20)  # it has announced itself, and nobody has looked yet
+    board.set_pressures(tick, HALF)
+    run_pumps(board, 100)
+    assert board.lost is not None
+    assert port.count(protocol.Set) == sets
+    assert not any(port.board.counts)
+
+
+def test_vented_is_a_word_from_after_the_request(rig):
+    """One that was on its way already says nothing: the board may have been armed since."""
+    board, port = rig
+    port.run(110)
+    assert port.pending
+    assert board.vent()
+    asked_ms = max(at for at, data in port.written
+                   for frame in protocol.Parser().feed(data) if isinstance(frame.message, protocol.Vent))  # fmt: skip
+    assert port.now_ms - 1e3 * board.status_age_s > asked_ms
+
+
+def test_a_valve_that_stays_open_is_seen_by_its_sensor(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 2)
+    port.follows = False  # the sensors go on showing 0.2 bar
+    port.board.measured[1:6] = [0] * 5
+    assert board.vent()
+    began_ms = port.now_ms
+    assert board.still_pressed() == pytest.approx({0: 0.2})
+    assert 950 <= port.now_ms - began_ms <= 1100
+
+
+def test_a_robot_that_empties_is_waited_for_no_longer_than_needed(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 2)
+    assert board.vent()
+    began_ms = port.now_ms
+    assert board.still_pressed() == {}
+    assert port.now_ms - began_ms <= 100
+
+
+def test_empty_means_the_same_on_both_sides():
+    limit = re.search(r"#define P_DOWN (\d+)", (ROOT / "firmware" / "limits.h").read_text())
+    assert protocol.to_units(DOWN_BAR) == int(limit[1])
 
 
 def test_restart_between_two_looks_is_seen_by_the_boot_id(rig):

@@ -9,8 +9,9 @@ import pytest
 import serial
 
 from modsoft.runtime import ports, protocol
+from modsoft.runtime import robot as robots
 from modsoft.runtime.board import Board
-from modsoft.runtime.errors import DeviceAbsent, LostInRun, PortBusy
+from modsoft.runtime.errors import DeviceAbsent, LostInRun, PortBusy, Tripped
 from modsoft.runtime.protocol import CHANNELS, PROTOCOL_HASH, Hello, State, Status
 
 HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 30000, 20000, 300, 1000)
@@ -97,6 +98,28 @@ def test_port_that_fails_before_hello():
     with pytest.raises(DeviceAbsent, match="the port failed"):
         Board(port)
     assert port.closed
+
+
+class ArmedPort(ScriptedPort):
+    """A board that somebody else has armed, on virtual time; it never answers to an ARM."""
+
+    def __init__(self):
+        super().__init__()
+        self.now_s = 0.0
+
+    def read(self, size=1):
+        self.now_s += 0.02
+        if not self.said_hello:
+            self.said_hello = True
+            return protocol.encode(HELLO)
+        return protocol.encode(STATUS._replace(state=State.ARMED), session=9)
+
+
+def test_arming_waits_for_the_session_that_was_asked_for():
+    port = ArmedPort()
+    board = Board(port, clock=lambda: port.now_s, threaded=False)
+    with pytest.raises(Tripped, match="did not arm within 4 s, its state is ARMED"):
+        board.arm(robots.load("pneumatic-3"))
 
 
 # ---- ports

@@ -20,8 +20,11 @@ ROBOT = robots.load("pneumatic-3")
 class Board:
     """Answers a request to vent with `word`, or raises it."""
 
-    def __init__(self, word):
-        self.word, self.modes, self.statistics = word, [], {"sets": 3}
+    def __init__(self, word, pressed=()):
+        self.word, self.modes, self.statistics, self.pressed = word, [], {"sets": 3}, dict(pressed)
+
+    def still_pressed(self):
+        return self.pressed
 
     def vent(self, mode):
         self.modes.append(mode)
@@ -79,6 +82,18 @@ def test_what_ended_the_run_is_raised_after_the_venting(tmp_path, capsys, error,
     assert ending.meta["exit_code"] == code
     assert ending.meta["reason"]
     assert ("yes, said" in ending.said) == word
+
+
+@pytest.mark.parametrize("error", [None, Interrupted(2), LostInRun("tracker lost")])
+def test_pressure_that_stays_after_the_venting_is_said_and_trips(tmp_path, capsys, error):
+    ending = Ending(tmp_path, capsys, Board(True, {2: 0.213}), error)
+    assert isinstance(ending.raised, Tripped)
+    said = str(ending.raised)
+    assert "the valves are commanded to 0, but channel 2 still measures 0.21 bar" in said
+    assert "\n" not in said
+    assert ("tracker lost" in said) == isinstance(error, LostInRun)
+    assert (ending.meta["exit_code"], ending.meta["reason"]) == (79, said)
+    assert (ending.end["exit_code"], ending.end["vented"], ending.end["still_bar"]) == (79, True, {"2": 0.213})
 
 
 def test_the_stop_key_vents_at_once(tmp_path, capsys):

@@ -1,0 +1,70 @@
+"""The conversation as a state machine: what is taken for an answer and what is not."""
+
+from __future__ import annotations
+
+import pytest
+
+from modsoft.runtime.link import HEARTBEAT_S, Link, Phase
+from modsoft.runtime.protocol import CHANNELS, PROTOCOL_HASH, Hello, Set, State, Status, encode
+
+HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 30000, 20000, 300, 1000)
+ZERO = (0,) * CHANNELS
+IDLE = Status(0, State.IDLE, 0, 7, 1, 0, ZERO, ZERO, 0, 0, 0, 5000)
+
+
+def ready():
+    link = Link(0.0)
+    link.feed(encode(HELLO), 0.1)
+    assert link.phase is Phase.READY
+    return link
+
+
+def armed():
+    link = ready()
+    link.poll(0.1)
+    link.arm(0x3F, 30000)
+    link.poll(0.2)
+    link.feed(encode(IDLE._replace(state=State.ARMED), session=1), 0.21)
+    assert (link.session, link.armed, link.busy) == (1, True, False)
+    return link
+
+
+def test_an_acknowledgement_is_of_this_session():
+    link = armed()
+    seq = link.set(Set(1, ZERO))
+    link.poll(0.22)
+    told = IDLE._replace(state=State.RUNNING, acked_seq=seq)
+    link.feed(encode(told, session=2), 0.23)
+    assert link.ack_latency_s is None
+    link.feed(encode(told, session=1), 0.24)
+    assert link.ack_latency_s == pytest.approx(0.02)
+
+
+def test_what_was_said_before_the_announcement_is_forgotten():
+    link = Link(0.0)
+    link.feed(encode(IDLE), 0.05)
+    assert link.status is not None
+    link.feed(encode(HELLO), 0.1)
+    assert link.status is None
+    assert not link.vented
+
+
+def test_the_second_of_heartbeats_begins_anew_after_a_gap():
+    link = ready()
+    for tenth in range(1, 15):
+        link.poll(0.1 * tenth)
+        link.feed(encode(IDLE), 0.1 * tenth + 0.01)
+    assert link.can_arm
+    link.poll(1.4 + 2.5 * HEARTBEAT_S)
+    link.feed(encode(IDLE), 1.4 + 2.5 * HEARTBEAT_S + 0.01)
+    assert not link.can_arm
+
+
+def test_another_session_is_not_the_one_asked_for():
+    link = ready()
+    link.poll(0.1)
+    link.arm(0x3F, 30000)
+    link.poll(0.2)
+    link.feed(encode(IDLE._replace(state=State.ARMED), session=9), 0.21)
+    assert not link.armed
+    assert link.busy
