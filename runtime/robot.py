@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Meta
 
 from modsoft.runtime.errors import RobotFileError
+from modsoft.runtime.explain import explain
 
 
 class Kind(NamedTuple):
@@ -52,7 +53,7 @@ class Valve(Section, frozen=True):
 
     model: str
     full_scale_bar: Annotated[float, Meta(gt=0.0, le=10.0)]  # off the label: 10 V mean another pressure on each type
-    signal: str
+    signal: Literal["0-10 V"]  # what the board and its amplifiers give; a current loop would need other ones
     p_min_bar: Bar = 0.08
     p_max_bar: Bar = 0.35
 
@@ -160,6 +161,8 @@ def text_of(name: str) -> str:
 def load(file_or_name: str | Path) -> Robot:
     """Reads a robot file, or a shipped robot by its name. A file wins where both exist."""
     path = Path(file_or_name)
+    if path.is_dir():
+        raise RobotFileError(f"{path} is a folder, expected a robot file; give the file, such as {path / 'robot.toml'}")
     if path.is_file():
         try:
             text = path.read_text(encoding="utf-8")
@@ -188,7 +191,7 @@ def from_dict(table: dict[str, Any], where: str = "robot") -> Robot:
     try:
         robot = msgspec.convert(table, Robot)
     except msgspec.ValidationError as error:
-        raise RobotFileError(f"{where}: {error}") from error
+        raise RobotFileError(f"{where}: {explain(table, Robot, error)}") from error
     _check(robot, where)
     return robot
 
@@ -220,10 +223,15 @@ def _check(robot: Robot, where: str) -> None:
     wanted: Counter[tuple[int, str]] = Counter((module, side) for module in range(1, count + 1) for side in "+-")
     found: Counter[tuple[int, str]] = Counter((chamber.module, chamber.side) for chamber in robot.chambers)
     if found != wanted:
-        wrong = sorted((found - wanted) + (wanted - found))
+        wrong = [
+            f"{word}: {', '.join(f'module {module} side {side}' for module, side in sorted(places))}"
+            for word, places in (("missing", wanted - found), ("too many", found - wanted))
+            if places
+        ]
         refuse(
-            f"[[chambers]] of {count} modules wrong at {', '.join(f'module {m} side {s}' for m, s in wrong)}",
-            "each module from 1 with one chamber '+' and one '-'",
+            f"[[chambers]] of {count} modules, {'; '.join(wrong)}",
+            f"one chamber '+' and one '-' for each module from 1 to {count}: "
+            "add or delete [[chambers]], or correct modules under [robot]",
         )
     channels = Counter(chamber.channel for chamber in robot.chambers)
     twice = sorted(channel for channel, uses in channels.items() if uses > 1)
