@@ -96,16 +96,28 @@ def load_task(name_or_file: str, robot: Robot) -> Array:
     """A task by its name, or from a .npy file of unit vectors (steps, N, 3)."""
     if not name_or_file.endswith(".npy"):
         return task(name_or_file, robot.robot.kind, robot.modules)
+    if Path(name_or_file).is_dir():
+        raise UsageError(f"task file {name_or_file} is a folder; give an existing .npy file or a task's name")
     if not Path(name_or_file).is_file():
         raise UsageError(f"no task file {name_or_file!r}; give an existing .npy file or a task's name")
     try:
         desired = np.load(name_or_file, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"task file {name_or_file}: not a readable .npy array ({error})") from error
-    if desired.ndim != 3 or desired.shape[1:] != (robot.modules, 3) or not len(desired):
+    except OSError as error:
+        raise UsageError(f"task file {name_or_file}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, EOFError) as error:
+        # Without numpy's own words: they advise to load the file unsafely.
+        raise UsageError(
+            f"task file {name_or_file}: not a readable .npy array of floats: damaged, or of another format; "
+            "write it again with numpy.save"
+        ) from error
+    if not isinstance(desired, np.ndarray):
+        raise UsageError(f"task file {name_or_file}: an archive of arrays (.npz); write one array with numpy.save")
+    if desired.ndim != 3 or desired.shape[1:] != (robot.modules, 3):
         raise UsageError(
             f"task file {name_or_file}: found shape {desired.shape}, expected (steps, {robot.modules}, 3)"
         )
+    if not len(desired):
+        raise UsageError(f"task file {name_or_file}: found 0 steps, expected at least 1")
     if desired.dtype.kind != "f" or not np.allclose(np.linalg.norm(desired, axis=-1), 1.0, atol=1e-6):
         raise UsageError(f"task file {name_or_file}: every [v_x, v_y, v_z] must be a unit vector of floats")
     return desired.astype(np.float64)

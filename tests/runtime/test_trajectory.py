@@ -69,3 +69,22 @@ def test_task_file_missing_or_damaged(tmp_path):
     (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY broken")
     with pytest.raises(UsageError, match="not a readable"):
         trajectory.load_task(str(tmp_path / "bad.npy"), robot.load("pneumatic-2"))
+    np.save(tmp_path / "objects.npy", np.array([None]), allow_pickle=True)
+    (tmp_path / "empty.npy").write_bytes(b"")
+    for name in ("bad.npy", "objects.npy", "empty.npy"):
+        with pytest.raises(UsageError, match=r"not a readable .* numpy\.save") as caught:
+            trajectory.load_task(str(tmp_path / name), robot.load("pneumatic-2"))
+        assert "pickle" not in str(caught.value)
+    (tmp_path / "folder.npy").mkdir()
+    with pytest.raises(UsageError, match="is a folder"):
+        trajectory.load_task(str(tmp_path / "folder.npy"), robot.load("pneumatic-2"))
+
+
+def test_task_file_without_a_step_and_archives(tmp_path):
+    np.save(tmp_path / "none.npy", np.zeros((0, 2, 3)))
+    with pytest.raises(UsageError, match="found 0 steps, expected at least 1"):
+        trajectory.load_task(str(tmp_path / "none.npy"), robot.load("pneumatic-2"))
+    with (tmp_path / "many.npy").open("wb") as file:
+        np.savez(file, a=np.zeros((1, 2, 3)))
+    with pytest.raises(UsageError, match="archive of arrays"):
+        trajectory.load_task(str(tmp_path / "many.npy"), robot.load("pneumatic-2"))
