@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,20 +10,10 @@ import click
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.command import entry
+from modsoft.runtime.errors import RobotFileError, UsageError
 
 
-def _at_once(action: Any) -> Any:
-    """A click callback for an option that does one thing and ends the command."""
-
-    def callback(context: click.Context, parameter: click.Parameter, value: Any) -> None:
-        if value and not context.resilient_parsing:
-            action(value)
-            context.exit()
-
-    return callback
-
-
-def _print_ports(_: bool) -> None:
+def _print_ports() -> None:
     from modsoft.runtime.ports import list_ports  # --help does without pyserial
 
     found = list_ports()
@@ -33,7 +24,14 @@ def _print_ports(_: bool) -> None:
 
 
 def _check_robot(name: str) -> None:
+    from modsoft.runtime.trajectory import load_task  # --help does without numpy
+
     robot = robots.load(name)
+    if robot.loop.task:
+        try:
+            load_task(robot.loop.task, robot)
+        except UsageError as error:
+            raise RobotFileError(f"{name}: task under [loop]: {error}") from error
     click.echo(f"{name}: {robot.name}, {robot.robot.kind}, {robot.modules} modules, {robot.loop.hz:g} Hz")
     if robot.valve is not None:
         valve = robot.valve
@@ -41,7 +39,49 @@ def _check_robot(name: str) -> None:
                    f"{valve.p_max_bar:g} bar; is full_scale_bar what the label says?")  # fmt: skip
     for chamber in robot.chambers:
         click.echo(f"module {chamber.module} side {chamber.side}: channel {chamber.channel}")
+    open_ends = _open_ends(robot, Path(name).parent if Path(name).is_file() else Path())
+    if open_ends:
+        click.echo(f"still to fill in before a run: {'; '.join(open_ends)}")
     click.echo("ok")
+
+
+def _open_ends(robot: robots.Robot, beside: Path) -> list[str]:
+    """What a valid robot file leaves to the command line, in words. Tool files lie in the folder `beside`."""
+    found = [] if robot.loop.task else ["task under [loop], or --task"]
+    if robot.valve is None:
+        return found  # simulated: there is nothing to connect
+    tracker = robot.tracker
+    if not tracker.port:
+        found.append("port under [tracker], or --tracker-port")
+    if tracker.source == "ndi" and tracker.type != "aurora":  # aurora's tools are wired
+        if not tracker.tools:
+            found.append("tools under [tracker], or --tool")
+        found += [f"{beside / tool}, which is not there" for tool in tracker.tools if not (beside / tool).is_file()]
+    if not robot.serial.port:
+        found.append("port under [serial], or --port")
+    return found
+
+
+def _instead(list_ports: bool, check: str | None, print_robot: str | None) -> bool:
+    """Does what was asked for in place of a run, if anything was."""
+    asked = [list_ports, check is not None, print_robot is not None]
+    if sum(asked) > 1:
+        raise UsageError("--list-ports, --check and --print-robot do one thing each and leave; give one of them")
+    if list_ports:
+        _print_ports()
+    if check is not None:
+        _check_robot(check)
+    if print_robot is not None:
+        click.echo(robots.text_of(print_robot), nl=False)
+    return any(asked)
+
+
+def _somebody_there() -> bool:
+    """Whether a person can press Enter."""
+    try:
+        return sys.stdin is not None and sys.stdin.isatty()
+    except ValueError:  # closed
+        return False
 
 
 @click.command("modsoft-runtime", context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
@@ -56,7 +96,7 @@ def _check_robot(name: str) -> None:
               help="edge, down, or a .npy file of desired configurations (steps, modules, 3). [default: task under "
                    "[loop] in the robot file]")  # fmt: skip
 @click.option("--steps", type=click.IntRange(1), metavar="N", help="Stop after the first N control steps.")
-@click.option("--tracker", default="", type=click.Choice(["", "ndi", "replay"]), metavar="ndi|replay",
+@click.option("--tracker", type=click.Choice(["ndi", "replay"]), metavar="ndi|replay",
               help="Where frames come from. [default: source under [tracker] in the robot file]")  # fmt: skip
 @click.option("--tracker-port", default="", metavar="PORT",
               help="Serial port of the tracker (vega: its address; replay: a run's folder). [default: port under "
@@ -68,12 +108,11 @@ def _check_robot(name: str) -> None:
               help="Where the log of each run is kept.")  # fmt: skip
 @click.option("--yes", is_flag=True, help="Arm without asking.")
 @click.option("--dry-run", is_flag=True, help="Everything but the board: no valve port is opened.")
-@click.option("--list-ports", is_flag=True, is_eager=True, expose_value=False, callback=_at_once(_print_ports),
+@click.option("--list-ports", is_flag=True,
               help="List the serial ports of this machine, Arduino MEGAs first, and leave.")  # fmt: skip
-@click.option("--check", metavar="FILE", is_eager=True, expose_value=False, callback=_at_once(_check_robot),
-              help="Read a robot file, say what it means, and leave.")  # fmt: skip
-@click.option("--print-robot", metavar="NAME", is_eager=True, expose_value=False,
-              callback=_at_once(lambda name: click.echo(robots.text_of(name), nl=False)),
+@click.option("--check", metavar="FILE",
+              help="Read a robot file, say what it means and what it lacks, and leave.")  # fmt: skip
+@click.option("--print-robot", metavar="NAME",
               help="Print a shipped robot's file to start your own from, and leave: cable-4, cable-6, pneumatic-2, "
                    "pneumatic-3.")  # fmt: skip
 @click.version_option(None, "-V", "--version", package_name="modsoft", prog_name="modsoft-runtime")
@@ -100,8 +139,13 @@ def cli(**told: Any) -> None:
       79 stopped by a limit, a fault or a stop key
       130 Ctrl-C               143 SIGTERM        129 SIGHUP
     """
+    if _instead(told.pop("list_ports"), told.pop("check"), told.pop("print_robot")):
+        return
+    if not told["yes"] and not told["dry_run"] and not _somebody_there():
+        raise UsageError("arming asks for Enter, and there is no terminal to press it at; give --yes, or --dry-run")
     from modsoft.runtime.session import Options, run  # --help does without numpy and onnxruntime
 
+    told["tracker"] = told["tracker"] or ""
     told["runs"] = told.pop("runs_dir")
     run(Options(**told))
 

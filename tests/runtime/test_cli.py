@@ -19,8 +19,8 @@ def run(*arguments, cwd=None):
 
 
 def refused(code, *arguments, cwd=None):
-    """The one line that the command ends with."""
-    done = run(*arguments, cwd=cwd)
+    """The one line that the command ends with; nobody is there to press Enter."""
+    done = run("--yes", *arguments, cwd=cwd)
     assert done.returncode == code, done.stderr
     assert done.stdout == ""
     [line] = done.stderr.splitlines()
@@ -83,8 +83,49 @@ def test_check_robot(tmp_path):
     assert "chambers" in refused(64, "--check", tmp_path / "robot.toml")
 
 
+def test_check_tells_what_is_still_to_fill_in(tmp_path):
+    line = run("--check", "pneumatic-3").stdout.splitlines()[-2]
+    assert line == (
+        "still to fill in before a run: port under [tracker], or --tracker-port; tools under [tracker], or --tool; "
+        "port under [serial], or --port"
+    )
+    path = tmp_path / "robot.toml"
+    text = robots.text_of("pneumatic-3").replace('port = ""', 'port = "/dev/null"')
+    path.write_text(text.replace('task = "down"', 'task = ""').replace("tools = []", 'tools = ["0", "1", "2", "3"]'))
+    for tool in "013":
+        (tmp_path / tool).touch()
+    line = run("--check", path).stdout.splitlines()[-2]
+    assert line == f"still to fill in before a run: task under [loop], or --task; {tmp_path / '2'}, which is not there"
+    path.write_text(text.replace('"polaris"', '"aurora"'))
+    assert "still to fill in" not in run("--check", path).stdout
+    assert "still to fill in" not in run("--check", "cable-4").stdout
+
+
+@pytest.mark.parametrize(("task", "expected"), [("up", "edge, down"), ("none.npy", "no task file")])
+def test_check_proves_the_task(tmp_path, task, expected):
+    path = tmp_path / "robot.toml"
+    path.write_text(robots.text_of("pneumatic-3").replace('task = "down"', f'task = "{task}"'))
+    line = refused(64, "--check", path, cwd=tmp_path)
+    assert "task under [loop]" in line
+    assert expected in line
+
+
 def test_list_ports():
     assert run("--list-ports").returncode == 0
+
+
+def test_one_thing_at_a_time():
+    assert "give one of them" in refused(2, "--list-ports", "--check", "pneumatic-3")
+    assert "give one of them" in refused(2, "--print-robot", "pneumatic-3", "--check", "pneumatic-3")
+
+
+@pytest.mark.parametrize("redirected", ["</dev/null", "<&-"])
+def test_nobody_there_to_press_enter_is_said_at_once(tmp_path, redirected):
+    command = ["sh", "-c", f'"$0" --port nowhere {redirected}', SCRIPT]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=60)
+    assert done.returncode == 2
+    [line] = done.stderr.splitlines()
+    assert "give --yes" in line
 
 
 def test_version():
@@ -177,10 +218,12 @@ def test_usage(wrong):
     done = run("--robot", "pneumatic-3", *wrong)
     assert done.returncode == 2
     assert wrong[0] in done.stderr
+    assert "''" not in done.stderr
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_the_exit_code_survives_a_standard_error_that_cannot_be_written():
     with open("/dev/full", "w") as full:
-        done = subprocess.run([SCRIPT, "--robot", "cable-4"], stderr=full, stdin=subprocess.DEVNULL, timeout=60)
+        told = ["--yes", "--robot", "cable-4"]
+        done = subprocess.run([SCRIPT, *told], stderr=full, stdin=subprocess.DEVNULL, timeout=60)
     assert done.returncode == 64
