@@ -155,11 +155,16 @@ class RunLog:
             self._writer.error = error.strerror or str(error)
 
     def _write_meta(self, end: Line) -> None:
-        """Whole or not at all."""
+        """Whole or not at all: a full disk leaves no half beside the meta.json before."""
         made = self.folder / "meta.json.new"
         text = json.dumps(plain({**self._meta, **end}), indent=1, allow_nan=False)
-        made.write_text(text + "\n", encoding="utf-8")
-        made.replace(self.folder / "meta.json")
+        try:
+            made.write_text(text + "\n", encoding="utf-8")
+            made.replace(self.folder / "meta.json")
+        except OSError:
+            with contextlib.suppress(OSError):
+                made.unlink(missing_ok=True)
+            raise
 
 
 def _new_folder(runs: Path, name: str) -> Path:

@@ -86,10 +86,12 @@ def _checked(kind: str, tools: list[Path], count: int) -> list[Path]:
         return []
     if len(tools) != count:
         raise UsageError(
-            f"{len(tools)} tool definition files, the robot needs {count}: base, then modules 1 to {count - 1}; "
+            f"{len(tools)} tool definition file{'' if len(tools) == 1 else 's'}, the robot needs {count}: base, then modules 1 to {count - 1}; "
             "give --tool FILE for each in this order, or tools under [tracker] in the robot file"
         )
     for path in tools:
+        if path.is_dir():
+            raise UsageError(f"tool definition file {path} is a folder; give the .rom file in it")
         if not path.is_file():
             raise DeviceAbsent(f"tool definition file {path} does not exist; the tracker cannot know that tool")
     return tools

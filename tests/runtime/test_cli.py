@@ -201,7 +201,14 @@ def test_recorded_frames_drive_no_valve(tmp_path, port, model_file):
 def test_no_tools_told(port, model_file):
     told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
     line = refused(2, *told)
+    assert "0 tool definition files" in line
     assert "--tool" in line
+    assert ": 1 tool definition file, " in refused(2, *told, "--tool", "base.rom")
+
+
+def test_a_folder_for_a_tool(tmp_path, port, model_file, tools):
+    told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
+    assert "is a folder" in refused(2, *told, *tools[:-1], tmp_path)
 
 
 def test_tools_of_a_robot_file_lie_beside_it(tmp_path, port, model_file):

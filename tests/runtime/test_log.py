@@ -155,6 +155,21 @@ def test_what_a_hanging_disk_still_owes_at_the_end_is_told(tmp_path, monkeypatch
     freed.set()
 
 
+def test_a_full_disk_leaves_no_half_meta_file(tmp_path, monkeypatch):
+    log = a_log(tmp_path)
+    write = Path.write_text
+
+    def full(path: Path, text: str, **how: str) -> int:
+        write(path, text[:20], **how)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_text", full)
+    log.close(0, "done", {})
+    assert os.strerror(errno.ENOSPC) in log.trouble
+    assert not (log.folder / "meta.json.new").exists()
+    assert json.loads((log.folder / "meta.json").read_text())["exit_code"] is None
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_a_real_full_device(tmp_path):
     (tmp_path / "run.jsonl").symlink_to("/dev/full")
