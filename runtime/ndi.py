@@ -85,8 +85,9 @@ def _checked(kind: str, tools: list[Path], count: int) -> list[Path]:
     if kind == "aurora":
         return []
     if len(tools) != count:
+        files = "file" if len(tools) == 1 else "files"
         raise UsageError(
-            f"{len(tools)} tool definition file{'' if len(tools) == 1 else 's'}, the robot needs {count}: base, then modules 1 to {count - 1}; "
+            f"{len(tools)} tool definition {files}, the robot needs {count}: base, then modules 1 to {count - 1}; "
             "give --tool FILE for each in this order, or tools under [tracker] in the robot file"
         )
     for path in tools:
