@@ -48,7 +48,7 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
 
     exported = export(model, out, meta)
     report, said = exported.report, exported.description
-    click.echo(f"{exported.path}: {exported.path.stat().st_size / 1e6:.1f} MB, SHA-256 {said.file_sha256}")
+    click.echo(f"{exported.path}: {exported.path.stat().st_size / 1e6:.1f} MB, seal {said.file_sha256}")
     modules = ", ".join(map(str, said.modules_trained_on))
     click.echo(f"for {said.kind} robots at {1.0 / said.period_s:g} Hz, trained on {modules} modules")
     click.echo(
@@ -59,7 +59,7 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
     for name, errors in (
         ("one run", report.fused),
         ("chain", report.chain),
-        ("a sweep less", report.one_sweep_fewer),
+        ("last sweep", report.one_sweep_fewer),
     ):
         click.echo(f"  {name:<12}" + "".join(f"{error:>10.1e}" for error in errors.values()))
 

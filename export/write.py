@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from modsoft.runtime import robot as robots
 from modsoft.runtime.artefact import Description, Golden
 from modsoft.runtime.controller import Controller
 from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.runtime.files import check_writable, written
 from modsoft.training import checkpoint as checkpoints
 
 
@@ -35,10 +35,11 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
     """
     model = Path(model)
     out = model.with_suffix(".onnx") if out is None else Path(out)
-    if not out.parent.is_dir() or out.is_dir():
-        raise UsageError(f"--out {out}: expected a file in a folder that is there")
+    check_writable(out)
     if out.resolve() == model.resolve():
         raise UsageError(f"--out {out}: that is the model to export; give it another name")
+    if model.suffix == ".onnx":
+        raise UsageError(f"{model}: is ONNX already; did you mean modsoft-export --inspect {model}?")
     checkpoint = source.read(model, None if meta is None else Path(meta))
     network = checkpoints.network_of(checkpoint)
     expected = parity.reference(network)
@@ -50,18 +51,13 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
         raise ModelError(f"{model}: provenance that is no plain value ({error})") from error
     content = artefact.sealed(graph.build(weights, network.lstm.num_layers, text).SerializeToString())
 
-    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-    try:
+    with written(out) as temporary:
         temporary.write_bytes(content)
-        report = parity.verify(temporary, network, expected)
-        described = Controller.load(temporary).description  # as the lab PC will, golden pairs included
-        os.replace(temporary, out)
-    except ModelError as error:
-        raise ModelError(f"{out} not written: {str(error).replace(str(temporary), out.name)}") from error
-    except OSError as error:
-        raise ModelError(f"{out} not written: {error.strerror}; make room or choose another --out") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        try:
+            report = parity.verify(temporary, network, expected)
+            described = Controller.load(temporary).description  # as the lab PC will, golden pairs included
+        except ModelError as error:
+            raise ModelError(f"{out} not written: {str(error).replace(str(temporary), out.name)}") from error
     return Exported(out, described, report)
 
 

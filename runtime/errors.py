@@ -39,6 +39,12 @@ class DeviceAbsent(ModsoftError):
     exit_code = 69
 
 
+class OutputError(ModsoftError):
+    """A file or folder cannot be written: read-only, or the disk is full."""
+
+    exit_code = 73
+
+
 class LostInRun(ModsoftError):
     """A device that worked at the start of the run was lost in the middle of it."""
 

@@ -13,7 +13,6 @@ It is read with `weights_only=True`, so that a file from a stranger runs no code
 
 from __future__ import annotations
 
-import os
 import pickle
 import zipfile
 import zlib
@@ -23,6 +22,7 @@ from typing import Any
 import torch
 
 from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import written
 from modsoft.training.networks import BiLSTM
 
 SCHEMA = 1
@@ -33,12 +33,11 @@ NOT_READABLE = (OSError, EOFError, RuntimeError, ValueError, LookupError, zipfil
 
 def save(checkpoint: dict[str, Any], path: Path) -> None:
     """Writes to a temporary name beside `path` and renames, so that a kill leaves the old file or the new one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        torch.save(checkpoint, temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with written(path) as temporary:
+        try:
+            torch.save(checkpoint, temporary)
+        except RuntimeError as error:  # what torch makes of a full disk
+            raise OSError(str(error).splitlines()[0]) from error
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import check_writable
 from modsoft.runtime.robot import Robot
 from modsoft.training import dataset, plants
 from modsoft.training.backends import BACKENDS
@@ -149,8 +150,7 @@ def collect(
     recipe = recipe_of(robot, strategy, seed, steps, plant.name)
     out = out.absolute()  # workers may stand in another folder
     shards = Shards(out.with_name(f"{out.name}.parts"))
-    if not out.parent.is_dir():
-        raise UsageError(f"no folder {out.parent} for the data set {out.name}; make it first")
+    check_writable(out)
     _sweep(out)
     if out.exists():
         header = _finished(out, recipe, count)

@@ -132,7 +132,7 @@ def plot(data_files: tuple[Path, ...], out: Path) -> None:
         click.echo(coverage.line(each))
 
 
-main = entry(cli)
+main = entry(cli, goes_on=True)
 
 if __name__ == "__main__":
     main()

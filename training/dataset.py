@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import episode_features, state_of
 from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import written
 from modsoft.runtime.robot import Robot
 
 SCHEMA = 1
@@ -100,25 +100,24 @@ def join(
 ) -> Header:
     """`write` for `count` episodes that come one after the other and are never in memory together."""
     redrawn = 0
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with h5py.File(temporary, "w") as file:
-            for index, episode in enumerate(episodes):
-                if index == 0:
-                    for name in ("configuration", "action"):
-                        file.create_dataset(name, (count, *getattr(episode, name).shape), np.float64)
-                if not episode.is_finite():  # the last door: none may get here
-                    raise ModelError(f"episode {index} is not finite; not written to {path}")
-                file["configuration"][index] = episode.configuration
-                file["action"][index] = episode.action
-                redrawn += episode.redrawn
-            file.attrs["schema"] = SCHEMA
-            file.attrs["recipe"] = json.dumps(recipe, sort_keys=True)
-            file.attrs["stage_borders"] = stage_borders
-            file.attrs["redrawn"] = redrawn
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with written(path) as temporary:
+        try:
+            with h5py.File(temporary, "w") as file:
+                for index, episode in enumerate(episodes):
+                    if index == 0:
+                        for name in ("configuration", "action"):
+                            file.create_dataset(name, (count, *getattr(episode, name).shape), np.float64)
+                    if not episode.is_finite():  # the last door: none may get here
+                        raise ModelError(f"episode {index} is not finite; not written to {path}")
+                    file["configuration"][index] = episode.configuration
+                    file["action"][index] = episode.action
+                    redrawn += episode.redrawn
+                file.attrs["schema"] = SCHEMA
+                file.attrs["recipe"] = json.dumps(recipe, sort_keys=True)
+                file.attrs["stage_borders"] = stage_borders
+                file.attrs["redrawn"] = redrawn
+        except RuntimeError as error:  # what h5py makes of a disk that is full when it closes the file
+            raise OSError(" ".join(str(error).split())) from error
     return Header(recipe, stage_borders, redrawn, count)
 
 

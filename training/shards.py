@@ -17,7 +17,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from modsoft.runtime.errors import ModelError
+from modsoft.runtime.errors import ModelError, OutputError
+from modsoft.runtime.files import written
 from modsoft.training.dataset import Episode
 
 
@@ -29,16 +30,18 @@ class Shards:
 
     def open(self, recipe: dict[str, Any]) -> None:
         """Makes the folder, or checks that the one there belongs to the same recipe (`ModelError`)."""
-        self.folder.mkdir(exist_ok=True)
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.folder}: cannot be made ({error.strerror}); choose another --out") from error
         for stale in self.folder.glob(".*.tmp"):  # of a process that was killed while it wrote
             stale.unlink(missing_ok=True)
         told = self.folder / "recipe.json"
         if told.is_file():
             refuse_other(json.loads(told.read_text(encoding="utf-8")), recipe, self.folder)
             return
-        temporary = self.folder / f".recipe.{_here()}.tmp"
-        temporary.write_text(json.dumps(recipe, indent=1), encoding="utf-8")
-        os.replace(temporary, told)
+        with written(told) as temporary:
+            temporary.write_text(json.dumps(recipe, indent=1), encoding="utf-8")
 
     def finished(self) -> set[int]:
         """Indices of the episodes that are there. The folder is listed rather than asked for single files, for a
@@ -71,15 +74,13 @@ class Shards:
             ) from error
 
     def write(self, index: int, episode: Episode) -> None:
-        temporary = self.folder / f".{index}.{_here()}.tmp"
-        with temporary.open("wb") as file:
+        with written(self.path(index)) as temporary, temporary.open("wb") as file:
             np.savez(file, **episode._asdict())
-        os.replace(temporary, self.path(index))
 
     def remove(self) -> None:
         """Takes the folder away at one stroke; a worker still at work for a killed collection finds it gone."""
         if self.folder.exists():
-            trash = self.folder.with_name(f".{self.folder.name}.{_here()}.tmp")
+            trash = self.folder.with_name(f".{self.folder.name}.{socket.gethostname()}.{os.getpid()}.tmp")
             os.replace(self.folder, trash)
             shutil.rmtree(trash, ignore_errors=True)
 
@@ -92,7 +93,3 @@ def refuse_other(found: dict[str, Any], recipe: dict[str, Any], where: Path) -> 
         is_short = not isinstance(recipe[key], dict)
         what = f"{key} {found.get(key)}, asked for {recipe[key]}" if is_short else f"another {key}"
         raise ModelError(f"{where}: begun with {what}; give another --out, or delete it")
-
-
-def _here() -> str:
-    return f"{socket.gethostname()}.{os.getpid()}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import click
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from modsoft.runtime import robot as robots
 from modsoft.runtime.command import entry
 from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import check_writable, written
 from modsoft.runtime.robot import Robot
 
 Array = NDArray[np.float64]
@@ -24,8 +24,9 @@ def read_actions(path: str, robot: Robot) -> Array:
         actions = np.load(path, allow_pickle=False)
     except FileNotFoundError as error:
         raise ModelError(f"{path}: no such file; expected a .npy array {wanted}") from error
-    except (OSError, ValueError, EOFError) as error:
-        raise ModelError(f"{path}: not a .npy array ({error}); expected {wanted}") from error
+    except (OSError, ValueError, EOFError) as error:  # numpy's own words recommend loading it unsafely
+        why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged, or another format"
+        raise ModelError(f"{path}: not a .npy array of numbers ({why}); expected {wanted}") from error
     if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiu":
         raise ModelError(f"{path}: found no array of numbers; expected {wanted}")
     if actions.ndim != 3 or actions.shape[1:] != (robot.modules, robot.action_size) or not len(actions):
@@ -64,15 +65,8 @@ def simulate(robot: Robot, actions: Array) -> dict[str, Array]:
 
 def write(path: str, run: dict[str, Array]) -> None:
     """Writes the arrays to `path` as it is, all of them or none."""
-    part = Path(f"{path}.part-{os.getpid()}")
-    try:
-        with part.open("wb") as file:
-            np.savez(file, allow_pickle=False, **run)
-        part.replace(path)
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be written ({error}); give --out in a folder that can be") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with written(Path(path)) as part, part.open("wb") as file:
+        np.savez(file, allow_pickle=False, **run)
 
 
 @click.command("modsoft-simulate")
@@ -85,6 +79,7 @@ def command(robot_file: str, actions: str, out: str) -> None:
     --out gets configuration (steps + 1, modules, 3), that is [v_x, v_y, v_z], positions (steps + 1, modules, 3) in
     metres and directors (steps + 1, modules, 3, 3) with rows d1, d2, d3; row 0 is the robot at rest.
     """
+    check_writable(Path(out))
     robot = robots.load(robot_file)
     run = simulate(robot, read_actions(actions, robot))
     write(out, run)

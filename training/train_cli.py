@@ -76,7 +76,7 @@ def cli(data_file: Path, out: Path, **options: Any) -> None:
     click.echo(f"{out}: {said['iterations_done']} iterations in {said['seconds']:.0f} s")
 
 
-main = entry(cli)
+main = entry(cli, goes_on=True)
 
 if __name__ == "__main__":
     main()

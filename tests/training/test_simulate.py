@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from modsoft.runtime.errors import ModelError
+from modsoft.runtime.errors import OutputError, UsageError
 from modsoft.training import simulate
 
 
@@ -79,10 +79,20 @@ def test_an_unknown_robot_is_64(tmp_path, run):
     assert run("--robot", "pneumatic-9", "--actions", "a.npy", "--out", "run.npz")[0] == 64
 
 
-def test_an_output_that_cannot_be_written_leaves_nothing(tmp_path):
-    with pytest.raises(ModelError, match="cannot be written"):
-        simulate.write(str(tmp_path / "absent" / "run.npz"), {"configuration": np.zeros(1)})
+def test_an_output_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
+    run = {"configuration": np.zeros(1)}
+    with pytest.raises(UsageError, match="no folder"):
+        simulate.write(str(tmp_path / "absent" / "run.npz"), run)
     (tmp_path / "taken").mkdir()
-    with pytest.raises(ModelError, match="cannot be written"):
-        simulate.write(str(tmp_path / "taken"), {"configuration": np.zeros(1)})
+    with pytest.raises(UsageError, match="a folder"):
+        simulate.write(str(tmp_path / "taken"), run)
+    with pytest.raises(UsageError, match="a device"):
+        simulate.write("/dev/null", run)
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OutputError, match="No space left"):
+        simulate.write(str(tmp_path / "run.npz"), run)
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
