@@ -206,7 +206,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         axis.set(title=kind, xlabel="modules", ylabel="microseconds a robot and time step", yscale="log")
         axis.set_xticks(modules)
         axis.grid(visible=True, which="both", alpha=0.3)
-        axis.legend(fontsize=8)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
