@@ -58,7 +58,7 @@ def _run(command: click.Command, interrupted: str) -> int:
     try:
         code = command.main(standalone_mode=False)
         return code if isinstance(code, int) else 0
-    except SystemExit as error:
+    except SystemExit:
         if sys.stdout is not output:  # click wraps it at a broken pipe, and leaves with 1
             return BROKEN_PIPE_EXIT_CODE
         raise

@@ -100,7 +100,8 @@ def cli(
         if bar is not None:
             bar.close()
     lost = f"; {made.redrawn} robots went non-finite, were dropped and drawn again" if made.redrawn else ""
-    click.echo(f"{out}: {made.samples} samples in {made.episodes} episodes{lost}")
+    rounded = f" ({samples} rounded up to whole episodes of {steps})" if made.samples != samples else ""
+    click.echo(f"{out}: {made.samples} samples in {made.episodes} episodes{rounded}{lost}")
 
 
 def _option(text: str) -> tuple[str, Any]:

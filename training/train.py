@@ -20,6 +20,7 @@ import torch
 
 from modsoft.runtime.configuration import feature_names, labels
 from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import check_writable
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training.dataset import DataSet, Windows, split
 from modsoft.training.networks import BiLSTM
@@ -86,8 +87,9 @@ def train(
     progress: Callable[[Progress], None] = lambda told: None,
     clock: Callable[[], float] = time.monotonic,
 ) -> dict[str, Any]:
-    """Trains, writes the checkpoint `out` and gives it. Goes on from `out.resume` where one of the same data and
-    settings is there; one of others is refused. Sets torch's threads and random state for the whole process."""
+    """Trains, writes the checkpoint `out` and gives it. Where `out` is there already of the same data and settings it
+    is given as it is, and a run goes on from `out.resume`; either of others is refused. Sets torch's threads and random
+    state for the whole process."""
     torch.set_num_threads(settings.threads)
     torch.manual_seed(settings.seed)
     training, validation, test = split(data, settings.history, settings.split, settings.seed)
@@ -95,9 +97,18 @@ def train(
     network = BiLSTM(features, actions, settings.layers, settings.hidden, settings.dropout)
     identity = {"data_sha256": data.sha256(), **asdict(settings)}
     resume = out.with_name(f"{out.name}.resume")
+    check_writable(out)
+    if out.exists():
+        made = _finished(out, identity)
+        resume.unlink(missing_ok=True)  # killed between the last two lines below
+        return made
     state = _fit(network, training, validation, settings, identity, resume, progress, clock)
-    if state["best"] is None:
-        raise ModelError(f"{out}: training diverged, no weights have a finite validation error; try a smaller --rate")
+    if state["best"] is None or state["best_percent"] > 100.0:  # worse than any guess within the range can be
+        resume.unlink(missing_ok=True)  # there is nothing in it to go on from
+        raise ModelError(
+            f"{out}: training diverged, validation error {state['best_percent']:.3g} % of the actuation range at best; "
+            "try a smaller --rate"
+        )
 
     network.load_state_dict(state["best"])
     errors = estimation_errors(network, test)
@@ -124,8 +135,9 @@ def train(
             "samples": data.samples,
             "windows": [len(training), len(validation), len(test)],
             "iterations_done": state["iteration"],
+            "stopped_early": state["worse"] >= PATIENCE,
             "seconds": round(state["elapsed_s"], 1),
-            "validation_percent": state["best_percent"],
+            "validation_percent": float(state["best_percent"]),
             # Actuation estimation error of the test part, percent of the range, by module: the paper's Table 1.
             "errors_percent": [round(float(e), 4) for e in errors.mean(dim=(0, 2))],
             "errors_std_percent": [round(float(e), 4) for e in errors.std(dim=(0, 2), correction=0)],
@@ -222,6 +234,20 @@ def _share(iteration: int, elapsed_s: float, settings: Settings) -> float:
 def _checks_due(share: float) -> int:
     """How many looks at the validation error belong to a run that is over by `share`."""
     return math.floor(min(share, 1.0) * CHECKS + 1e-9)
+
+
+def _finished(out: Path, identity: dict[str, Any]) -> dict[str, Any]:
+    """The finished model that is there already; `ModelError` where it is of other data or settings."""
+    made = checkpoints.load(out)
+    said = made["provenance"]
+    differences = [key for key in identity if said.get(key) != identity[key]]
+    if differences:
+        key = differences[0]
+        raise ModelError(
+            f"{out}: there already, made with {key} {said.get(key)}, asked for {identity[key]}; "
+            "give another --out, or delete it"
+        )
+    return made
 
 
 def _resumed(resume: Path, identity: dict[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from pathlib import Path
@@ -11,6 +12,7 @@ import click
 
 from modsoft.runtime.command import entry
 from modsoft.runtime.errors import UsageError
+from modsoft.runtime.files import check_writable
 
 
 @click.command("modsoft-train", context_settings={"show_default": True})
@@ -45,8 +47,10 @@ def cli(data_file: Path, out: Path, **options: Any) -> None:
     Stopped or killed, the same command goes on from OUT.resume and ends with the same model. At the end it prints
     how far off the estimated actuation is on data never used, in percent of the actuation range.
     """
-    if not out.parent.is_dir():
-        raise UsageError(f"no folder {out.parent} for the model {out.name}; make it first")
+    if options["minutes"] is not None and not math.isfinite(options["minutes"]):
+        raise UsageError(f"--minutes {options['minutes']}: expected a number of minutes")
+    check_writable(out)
+    is_there = out.exists()
     # Before torch is loaded: by default its threads spin while they wait, and on a busy core that costs all speed.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from tqdm import tqdm
@@ -65,7 +69,7 @@ def cli(data_file: Path, out: Path, **options: Any) -> None:
                 first, smooth = told.iteration - 1, told.loss
             smooth = 0.98 * smooth + 0.02 * told.loss
             rate = (told.iteration - first) * settings.batch / (time.monotonic() - began_s)
-            best = f"{told.validation_percent:.2f} %"
+            best = f"{told.validation_percent:.2f} %" if math.isfinite(told.validation_percent) else "not yet known"
             bar.set_postfix_str(f"{rate:.0f} samples/s, loss {smooth:.5f}, best validation {best}", refresh=False)
             bar.update(100 * min(told.share, 1.0) - bar.n)
 
@@ -73,7 +77,11 @@ def cli(data_file: Path, out: Path, **options: Any) -> None:
     said = made["provenance"]
     for module, (mean, std) in enumerate(zip(said["errors_percent"], said["errors_std_percent"], strict=True), start=1):
         click.echo(f"module {module}: actuation estimated within {mean:.2f} +- {std:.2f} % of its range")
-    click.echo(f"{out}: {said['iterations_done']} iterations in {said['seconds']:.0f} s")
+    done = said["iterations_done"]
+    iterations = f"{done} iterations"
+    if done < settings.iterations and said.get("stopped_early"):
+        iterations = f"stopped after {done} of {settings.iterations} iterations, no better for {train.PATIENCE} checks,"
+    click.echo(f"{out}: {'there already, ' if is_there else ''}{iterations} in {said['seconds']:.0f} s")
 
 
 main = entry(cli, goes_on=True)

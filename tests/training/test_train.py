@@ -1,6 +1,7 @@
 """Training: it learns, it is deterministic, and a cut run ends as one that was not cut."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -61,11 +62,31 @@ def test_it_learns_and_the_checkpoint_says_all(tmp_path):
 
 def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
     one, again, other = (
-        train.train(make(), tmp_path / "model.pt", dataclasses.replace(SMALL, seed=seed))["weights"]
-        for seed in (0, 0, 1)
+        train.train(make(), tmp_path / f"{number}.pt", dataclasses.replace(SMALL, seed=seed))["weights"]
+        for number, seed in enumerate((0, 0, 1))
     )
     assert equal(one, again)
     assert not equal(one, other)
+
+
+def test_a_finished_model_is_kept_and_of_another_run_refused(tmp_path):
+    out = tmp_path / "model.pt"
+    made, told = train.train(make(), out, SMALL), []
+    before = out.read_bytes()
+    again = train.train(make(), out, SMALL, told.append)
+    assert equal(again["weights"], made["weights"])
+    assert not told
+    with pytest.raises(ModelError, match=r"there already, made with batch 32, asked for 64; give another --out"):
+        train.train(make(), out, dataclasses.replace(SMALL, batch=64))
+    assert out.read_bytes() == before
+
+
+@pytest.mark.parametrize("error", [math.nan, 1e9])
+def test_a_run_that_diverged_leaves_nothing_to_go_on_from(tmp_path, monkeypatch, error):
+    monkeypatch.setattr(train, "estimation_errors", lambda *_: torch.tensor(error))
+    with pytest.raises(ModelError, match="diverged"):
+        train.train(make(), tmp_path / "model.pt", SMALL)
+    assert not list(tmp_path.iterdir())
 
 
 class Cut(Exception):

@@ -65,6 +65,8 @@ def test_killed_and_started_again_it_ends_with_the_same_model(folder):
         (["bad.h5"], 65, "bad.h5: not a data set"),
         (["d.h5", "--out", "none/m.pt"], 2, "no folder none"),
         (["d.h5", "--minutes", "0"], 2, "minutes"),
+        (["d.h5", "--minutes", "nan"], 2, "minutes"),
+        (["d.h5", "--out", "."], 2, "."),
         ([], 2, "DATASET"),
     ],
 )
