@@ -136,6 +136,11 @@ def test_disk_full_leaves_nothing(model, monkeypatch):
     assert [entry.name for entry in model.parent.iterdir()] == ["model.pt"]
 
 
+def test_a_model_that_is_onnx_already_is_sent_to_inspect(model):
+    with pytest.raises(UsageError, match="did you mean modsoft-export --inspect"):
+        export(model.with_name("other.onnx"), model.with_name("new.onnx"))
+
+
 def test_out_must_be_a_file_in_a_folder(model, tmp_path):
     for out in (tmp_path / "nowhere" / "model.onnx", tmp_path):
         with pytest.raises(UsageError, match=r"no folder|a folder"):
