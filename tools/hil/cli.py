@@ -13,7 +13,6 @@ from pathlib import Path
 from types import FrameType
 
 import click
-from tqdm import tqdm
 
 from modsoft.runtime.command import entry
 from modsoft.runtime.controller import Controller
@@ -52,6 +51,8 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     The folder gets report.md, report.json, angles.png, run.jsonl (the runtime's log), board.jsonl (timer registers of
     the emulated board) and plant.jsonl (the simulated robot). Nothing else should keep the processor busy meanwhile.
     """
+    from tqdm import tqdm
+
     from modsoft.hil import judge, record  # after --help: matplotlib takes a second to import
     from modsoft.hil import report as reports
     from modsoft.hil.emulator import build, choose
@@ -97,7 +98,8 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     if found.runtime_exit:
         click.echo(f"modsoft-runtime said: {found.runtime_said or 'nothing'}")
     click.echo(f"{verdict}\n{report / 'report.md'}")
-    return verdict.exit_code
+    # a run that never began is judged by what the runtime said, not by the figures it could not have
+    return found.runtime_exit if found.runtime_exit and not len(found.tick) else verdict.exit_code
 
 
 @contextlib.contextmanager
