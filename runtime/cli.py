@@ -134,8 +134,8 @@ def cli(**told: Any) -> None:
     \b
     Exit codes:
       0 done, valves vented    2 usage            64 robot file      65 model or data
-      69 device not there      70 internal error  74 lost in the run 75 port in use
-      76 board of another version or for other hardware
+      69 device not there      70 internal error  73 cannot write    74 lost in the run
+      75 port in use           76 board of another version or for other hardware
       79 stopped by a limit, a fault or a stop key
       130 Ctrl-C               143 SIGTERM        129 SIGHUP
     """

@@ -272,4 +272,4 @@ def _say(text: str) -> None:
 
 
 def _angles(configuration: Array) -> str:
-    return ", ".join(f"{angle:.1f}" for angle in bending_angle_deg(configuration))
+    return ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in bending_angle_deg(configuration))  # not -0.0

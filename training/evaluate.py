@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from modsoft.runtime.actuation import limited
-from modsoft.runtime.configuration import Window, bending_angle_deg, state_of
+from modsoft.runtime.configuration import Window, bending_error_deg, state_of
 from modsoft.runtime.robot import Robot
 from modsoft.training.checkpoint import network_of
 
@@ -55,8 +55,7 @@ def angle_errors_deg(configuration: Array, desired: Array) -> Array:
     """|bending angle - desired bending angle| (K, N), degrees, of a planar robot: configuration measured at the start
     of period k against the desired one of step k, as the paper counts it. A controller that reaches every desired
     configuration exactly, one period later, is still charged with what the task moves in a period."""
-    measured = bending_angle_deg(configuration[: len(desired)])
-    return np.abs((measured - bending_angle_deg(desired) + 180.0) % 360.0 - 180.0)
+    return bending_error_deg(configuration[: len(desired)], desired)
 
 
 def configuration_errors_percent(configuration: Array, desired: Array) -> Array:
