@@ -239,25 +239,19 @@ def _checks_due(share: float) -> int:
 def _finished(out: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """The finished model that is there already; `ModelError` where it is of other data or settings."""
     made = checkpoints.load(out)
-    said = made["provenance"]
-    differences = [key for key in identity if said.get(key) != identity[key]]
-    if differences:
-        key = differences[0]
-        raise ModelError(
-            f"{out}: there already, made with {key} {said.get(key)}, asked for {identity[key]}; "
-            "give another --out, or delete it"
-        )
+    _check_same(f"{out}: there already, made", made["provenance"], identity, "give another --out, or delete it")
     return made
 
 
 def _resumed(resume: Path, identity: dict[str, Any]) -> dict[str, Any]:
     state = checkpoints.read(resume)
-    found = state.get("identity", {})
-    differences = [key for key in identity if found.get(key) != identity[key]]
-    if differences:
-        key = differences[0]
-        raise ModelError(
-            f"{resume}: of a run with {key} {found.get(key)}, asked for {identity[key]}; "
-            "ask for the same to go on, or delete it to start anew"
-        )
+    advice = "ask for the same to go on, or delete it to start anew"
+    _check_same(f"{resume}: of a run", state.get("identity", {}), identity, advice)
     return state
+
+
+def _check_same(what: str, found: dict[str, Any], identity: dict[str, Any], advice: str) -> None:
+    """`ModelError` at the first entry of `identity` that `found` has otherwise."""
+    for key, asked in identity.items():
+        if found.get(key) != asked:
+            raise ModelError(f"{what} with {key} {found.get(key)}, asked for {asked}; {advice}")

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import shutil
-import signal
 import sys
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from types import FrameType
 
 import click
 
@@ -70,7 +66,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     for name in WRITTEN:  # whatever is found there afterwards is of this run
         (report / name).unlink(missing_ok=True)
     options = [] if steps is None else ["--steps", str(steps)]
-    with _ended_in_order(), Rig(robot_file, report, board) as rig:
+    with Rig(robot_file, report, board) as rig:
         rig.run(model, task, *options)
         with tqdm(total=count, unit=" ticks", desc="run", disable=not sys.stderr.isatty()) as bar:
             rig.wait(count * robot.loop.period_s + RUN_SLACK_S, lambda ticks: bar.update(ticks - bar.n))
@@ -100,21 +96,6 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     click.echo(f"{verdict}\n{report / 'report.md'}")
     # a run that never began is judged by what the runtime said, not by the figures it could not have
     return found.runtime_exit if found.runtime_exit and not len(found.tick) else verdict.exit_code
-
-
-@contextlib.contextmanager
-def _ended_in_order() -> Iterator[None]:
-    """SIGTERM and SIGHUP leave through every `finally`, like Ctrl-C, with the exit code a shell expects."""
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        sys.exit(128 + number)
-
-    before = {number: signal.signal(number, leave) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 main = entry(cli)
