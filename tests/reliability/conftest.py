@@ -1,0 +1,66 @@
+"""One line for every row of the failure matrix that a test has shown: printed, and kept with `--matrix FILE`.
+
+`make reliability` makes docs/reliability.md from these lines (tools/reliability.py).
+"""
+
+import json
+
+import pytest
+
+ROW = "matrix_row"  # Under this name a line travels in a test's report.
+CLOCKS = ("emulated", "virtual", "host", "none")  # Whose time the worst figure is in.
+
+
+def pytest_addoption(parser):
+    group = parser.getgroup("failure matrix")
+    group.addoption("--matrix", metavar="FILE", help="append one JSON line for every row shown to this file")
+    group.addoption("--matrix-full", action="store_true", help="the matrix's full number of tries; takes hours")
+
+
+@pytest.fixture(scope="session")
+def full(pytestconfig):
+    """True where the matrix's full number of tries is asked: `tries = 100 if full else 4`."""
+    return pytestconfig.getoption("--matrix-full", default=False)
+
+
+@pytest.fixture
+def matrix_row(request):
+    """matrix_row(6, fault="cable pulled", tries=10, limit="vented in 700 ms", worst="484 ms", clock="emulated").
+
+    Called once for each line, before or after the test's assertions: a row counts as met where `met` is true and
+    its test passed. A row may have several lines (native and emulated); say which in `fault`. `clock`: "emulated"
+    (the board's cycle counter), "virtual" (an injected clock), "host" (the wall clock) or "none".
+    """
+
+    def add(row, *, fault, tries, limit, worst, clock="none", met=True):
+        assert 1 <= row <= 30, f"the failure matrix has no row {row}"
+        assert clock in CLOCKS, f"clock {clock!r}, not one of {CLOCKS}"
+        line = {"row": row, "fault": fault, "tries": int(tries), "limit": str(limit), "worst": str(worst)}
+        request.node.user_properties.append((ROW, {**line, "clock": clock, "met": bool(met)}))
+
+    return add
+
+
+class RowLines:
+    """Prints and keeps the lines as the tests end, in the one process that sees all reports (also under -n)."""
+
+    def __init__(self, config):
+        self.config = config
+
+    def pytest_runtest_logreport(self, report):
+        lines = [value for name, value in report.user_properties if name == ROW] if report.when == "call" else []
+        path = self.config.getoption("--matrix", default=None)
+        terminal = self.config.pluginmanager.get_plugin("terminalreporter")
+        for line in lines:
+            line = {**line, "met": line["met"] and report.passed, "test": report.nodeid}
+            if terminal:
+                terminal.ensure_newline()
+                terminal.write_line(json.dumps({name: line[name] for name in ("row", "tries", "limit", "worst")}))
+            if path:
+                with open(path, "a", encoding="utf-8") as file:
+                    file.write(json.dumps(line) + "\n")
+
+
+def pytest_configure(config):
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(RowLines(config))
