@@ -9,7 +9,7 @@ export MPLBACKEND ?= Agg
 PYTEST := .venv/bin/python -m pytest
 INSTALLED := .venv/.installed
 
-.PHONY: demo install test test-cluster check firmware clean
+.PHONY: demo install test test-cluster reliability check firmware clean
 
 demo: $(INSTALLED)
 	.venv/bin/python tools/demo.py
@@ -30,6 +30,10 @@ test: $(INSTALLED)
 # Collection through a real one-node SLURM, which the test installs and starts: root on Debian.
 test-cluster: $(INSTALLED)
 	$(PYTEST) -m cluster
+
+# The failure matrix, a test a row, to docs/reliability.md.
+reliability: $(INSTALLED)
+	.venv/bin/python tools/reliability.py
 
 check: $(INSTALLED)
 	tools/check.sh

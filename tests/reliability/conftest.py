@@ -29,14 +29,15 @@ def matrix_row(request):
 
     Called once for each line, before or after the test's assertions: a row counts as met where `met` is true and
     its test passed. A row may have several lines (native and emulated); say which in `fault`. `clock`: "emulated"
-    (the board's cycle counter), "virtual" (an injected clock), "host" (the wall clock) or "none".
+    (the board's cycle counter), "virtual" (an injected clock), "host" (the wall clock) or "none". `why`: the reason,
+    for a line that is not met.
     """
 
-    def add(row, *, fault, tries, limit, worst, clock="none", met=True):
+    def add(row, *, fault, tries, limit, worst, clock="none", met=True, why=""):
         assert 1 <= row <= 30, f"the failure matrix has no row {row}"
         assert clock in CLOCKS, f"clock {clock!r}, not one of {CLOCKS}"
         line = {"row": row, "fault": fault, "tries": int(tries), "limit": str(limit), "worst": str(worst)}
-        request.node.user_properties.append((ROW, {**line, "clock": clock, "met": bool(met)}))
+        request.node.user_properties.append((ROW, {**line, "clock": clock, "met": bool(met), "why": why}))
 
     return add
 

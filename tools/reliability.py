@@ -1,0 +1,208 @@
+"""The failure matrix: runs its tests and writes docs/reliability.md from the lines that they print.
+
+`make reliability` runs tests/reliability with the smaller numbers of tries, `tools/reliability.py --full` with those of
+the matrix. Exit code 1 where a row is missing or not met.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from modsoft.runtime import log
+from modsoft.runtime.command import entry
+from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import written
+
+ROOT = Path(__file__).resolve().parents[1]
+Line = dict[str, Any]
+FIELDS = ("row", "fault", "tries", "limit", "worst", "clock", "met", "why", "test")
+
+
+class Row(NamedTuple):
+    """A row of the matrix: what happens, what has to follow, and when that counts as shown."""
+
+    fault: str
+    required: str
+    accepted: str
+
+
+ROWS: dict[int, Row] = {
+    1: Row("bit flips", "drop, count",
+           "native parser 10^7 frames in tests, 10^8 on demand; firmware on the emulator 10^4 in tests, 10^6 on "
+           "demand: 0 wrong applied, recovery within one frame"),
+    2: Row("dropped, inserted bytes", "resynchronise at the next delimiter",
+           "10^6: 0 wrong, the next good frame always accepted"),
+    3: Row("truncated frame, silence inside a frame", "discarded; the link timer still fires", "as row 2"),
+    4: Row("duplicated, reordered, replayed old session", "acknowledged or refused, not applied",
+           "10^5: 0 applied again"),
+    5: Row("garbage at line rate, 10 s", "vent by the link timer, then answer",
+           "0 applied; vented in 700 ms; HELLO within 1 s after; no watchdog reset"),
+    6: Row("cable pulled", "board vents, host stops cleanly", "vented in 700 ms; host notices in 150 ms"),
+    7: Row("plugged in again under another name",
+           "found by its USB identity, HELLO, new ARM, never by itself to RUNNING", "IDLE in 8 s; 20 of 20"),
+    8: Row("board reset in mid-run", "host sees the boot id change, goes silent, sends no stale set-point",
+           "noticed in 1.2 s, outputs 0 in 130 ms, back in 6 s; 50 of 50"),
+    9: Row("host would talk to the bootloader", "silent until HELLO", "0 bytes in 100 opens"),
+    10: Row("host SIGKILLed", "board vents", "all 0 in 670 ms from 0.35 bar"),
+    11: Row("host SIGSTOPped; control thread stuck while I/O lives", "vent by link timer; by control timer",
+            "670 ms; 1.4 s; on return the fault is latched"),
+    12: Row("Ctrl-C, SIGTERM, SIGHUP, exception", "VENT, wait for the board's word, exit code",
+            '100 of 100 at random phases; "vented" is only said after the board said so'),
+    13: Row("tracker off, intermittent", "hold one tick, ramp-vent at three",
+            "vent starts within 1.2 s + 50 ms of the last good frame"),
+    14: Row("tracker frozen (same frame again)", "detected",
+            "within 3 ticks; no false alarm in 1 h of simulated noise"),
+    15: Row("stale, delayed frames", "never used", "0 older than one period used"),
+    16: Row("NaN (a missing tool is NaN in NDI's client)", "rejected, never reaches the model", "0 in 10^4"),
+    17: Row("outlier jump", "gated on the fastest possible motion",
+            "command unchanged on that tick; back within 3 ticks"),
+    18: Row("marker hidden, wrong number, swapped", "no partial state is used", "as row 13"),
+    19: Row("frame numbers or stamps going backwards", "dropped, counted", "0 used"),
+    20: Row("damaged model file", "refused before the port is opened",
+            "200 of 200 damaged files, within 2 s, no byte on the wire"),
+    21: Row("model of another state or action size, history, opset",
+            "refused, message names expected and found", "all"),
+    22: Row("model gives NaN or out of range", "fault, vent", "0 NaN sent"),
+    23: Row("channels do not match the robot file; protocol hash differs", "ARM refused", "all"),
+    24: Row("port busy, no permission, not our board", "clear error, own exit code", "within 3 s, no retry storm"),
+    25: Row("disk full while logging", "control goes on, the log says so", "no late tick"),
+    26: Row("starved processor, late ticks", "skip, never burst; log the lateness",
+            "two SETs never less than half a period apart; more than two missed: vent"),
+    27: Row("wall clock steps", "no effect", "commands identical"),
+    28: Row("firmware hangs", "watchdog", "outputs 0 in 130 ms"),
+    29: Row("pressure sensor stuck, over-pressure, leak", "fault, vent", "dump in 110 ms; leak in 2.1 s"),
+    30: Row("host does not read", "board keeps controlling", "loop jitter below 2 ms"),
+}  # fmt: skip
+
+CLOCKS = {"emulated": "board's cycles", "virtual": "injected", "host": "wall", "none": ""}
+
+HEAD = """# The failure matrix
+
+Every fault that modsoft knows, each injected by a test of its own in `tests/reliability/`, and what came of it. Made by
+`{command}` from the lines that the tests print, on {date}, {system}, {cores} cores. {score}
+
+- A row: what happens, what has to follow, and when that counts as shown. It may have several lines, where it was shown
+  twice (the firmware's logic compiled for the PC; the compiled firmware on the emulated board) or has several faults.
+- Tries: how often the fault was injected. On demand they are more: `tools/reliability.py --full`, `make soak`.
+- Worst: of all tries. Clock: whose time it is in. "board's cycles" is the emulated processor's own counter and does not
+  depend on how busy the PC is; "wall" does; "injected" is a clock that the test moves.
+"""
+
+TAIL = """
+## What no rig shows
+
+The board is emulated (ATmega2560 on simavr, behind the MEGA's bootloader), the tracker is a fake on a pseudo-terminal,
+the robot is simulated. So nothing here shows electrical noise, brown-out, real USB latency and drivers, the dynamics of
+air in hoses, leaks and chambers, what your valves do without power, the official bootloader binary as your board
+carries it, or markers and lenses. Pressures (row 29) are voltages on the board's analogue inputs, the cable (rows 6, 7)
+is a pseudo-terminal that goes away and comes back. Try the stop keys, the pulled cable and the killed PC once on the
+real robot, at low pressure, before trusting any of it.
+"""
+
+
+def read(path: Path) -> dict[int, list[Line]]:
+    """The lines of each row, in the order of their tests. A line that is said again replaces the one before, so that a
+    file may be added to. `ModelError` for what is no such line."""
+    found: dict[int, dict[tuple[str, str], Line]] = defaultdict(dict)
+    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            line = json.loads(text)
+            missing = [name for name in FIELDS if name not in line]
+        except (ValueError, TypeError):
+            missing = list(FIELDS)
+        if missing:
+            raise ModelError(f"{path}: line {number} has no {', '.join(missing)}; make it again with pytest --matrix")
+        found[line["row"]][(line["test"], line["fault"])] = line
+    return {row: sorted(lines.values(), key=lambda line: line["test"]) for row, lines in sorted(found.items())}
+
+
+def met(lines: Iterable[Line]) -> bool:
+    """Whether a row is shown: there is a line, and each is met."""
+    found = [line["met"] for line in lines]
+    return bool(found) and all(found)
+
+
+def table(rows: dict[int, list[Line]]) -> str:
+    """Markdown: every row of the matrix with its lines, or with the word that it has none."""
+    out = ["| # | fault | required | accepted when | shown as | tries | limit | worst | clock | met |"]
+    out += ["| ---: | --- | --- | --- | --- | ---: | --- | --- | --- | --- |"]
+    for number, row in ROWS.items():
+        head = [str(number), *row]
+        for line in rows.get(number, []) or [None]:
+            if line is None:
+                found = ["", "", "", "", "", "**missing**"]
+            else:
+                verdict = "yes" if line["met"] else f"**no**{': ' + line['why'] if line['why'] else ''}"
+                clock = CLOCKS.get(line["clock"], line["clock"])
+                found = [line["fault"], f"{line['tries']:,}", line["limit"], line["worst"], clock, verdict]
+            cells = (cell.replace("|", "\\|").replace("\n", " ") for cell in head + found)
+            out.append(f"| {' | '.join(cells)} |")
+            head = ["", "", "", ""]
+    return "\n".join(out)
+
+
+def score(rows: dict[int, list[Line]]) -> str:
+    """One sentence: how many are met, and which are not."""
+    missing = [row for row in ROWS if not rows.get(row)]
+    unmet = [row for row in ROWS if rows.get(row) and not met(rows[row])]
+    said = f"{len(ROWS) - len(missing) - len(unmet)} of {len(ROWS)} rows are met."
+    for word, which in (("Not met", unmet), ("Missing", missing)):
+        if which:
+            said += f" {word}: {', '.join(map(str, which))}."
+    return said
+
+
+def page(rows: dict[int, list[Line]], command: str) -> str:
+    """docs/reliability.md."""
+    host, date = log.host(), f"{datetime.now(UTC):%Y-%m-%d}"
+    head = HEAD.format(command=command, date=date, system=host["system"], cores=host["cores"], score=score(rows))
+    return f"{head}\n{table(rows)}\n{TAIL}"
+
+
+def run_tests(lines: Path, full: bool) -> int:
+    """All tests of the matrix, those judged by the wall clock after the others and alone. The first exit code not 0."""
+    common = [sys.executable, "-m", "pytest", "-q", "tests/reliability", "--matrix", str(lines)]
+    common += ["--matrix-full", "--timeout", "7200"] if full else []
+    codes = [
+        subprocess.run([*common, *options], cwd=ROOT, check=False).returncode
+        for options in (["-n", str(min(2, os.cpu_count() or 1)), "-m", "not realtime"], ["-m", "realtime"])
+    ]
+    return next((code for code in codes if code), 0)
+
+
+@click.command("reliability", help=__doc__, context_settings={"show_default": True})
+@click.option("--full", is_flag=True, help="The matrix's own numbers of tries; takes hours.")
+@click.option("--lines", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+              help="Run nothing; make the page from the lines that pytest --matrix FILE kept.")  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path), default=ROOT / "docs" / "reliability.md",
+              show_default="docs/reliability.md", help="The page.")  # fmt: skip
+def cli(full: bool, lines: Path | None, out: Path) -> int:
+    command = "tools/reliability.py --full" if full else "make reliability"
+    code = 0
+    with tempfile.TemporaryDirectory() as folder:
+        if lines is None:
+            lines = Path(folder) / "lines.jsonl"
+            lines.touch()
+            code = run_tests(lines, full)
+        rows = read(lines)
+    with written(out) as new:
+        new.write_text(page(rows, command), encoding="utf-8")
+    click.echo(f"{score(rows)} {out}")
+    return 0 if not code and all(met(rows.get(row, [])) for row in ROWS) else 1
+
+
+main = entry(cli)
+
+if __name__ == "__main__":
+    main()
