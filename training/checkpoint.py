@@ -2,7 +2,8 @@
 
     schema      int, SCHEMA
     robot       the robot file of the data set, as plain values
-    network     {"name": "bilstm", "feature_size", "action_size", "layers", "hidden", "dropout", "history"}
+    network     {"name": one of networks.NETWORKS, "feature_size", "action_size", "layers", "hidden", "dropout",
+                "history", and "modules" where it is bound to a number of modules}
     features    ordered names of the F features
     weights     state dict
     provenance  {"data_sha256", "seed", "code_version", "date", "split", "samples", "iterations", "errors_percent", ...}
@@ -20,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import written
-from modsoft.training.networks import BiLSTM
+from modsoft.training import networks
 
 SCHEMA = 1
 KEYS = ("schema", "robot", "network", "features", "weights", "provenance")
@@ -73,12 +75,9 @@ def load(path: Path) -> dict[str, Any]:
     return checkpoint
 
 
-def network_of(checkpoint: dict[str, Any]) -> BiLSTM:
+def network_of(checkpoint: dict[str, Any]) -> nn.Module:
     """The network with its weights, in evaluation mode."""
-    sizes = checkpoint["network"]
-    network = BiLSTM(
-        sizes["feature_size"], sizes["action_size"], sizes["layers"], sizes["hidden"], sizes.get("dropout", 0.0)
-    )
+    network = networks.build(checkpoint["network"])
     try:
         network.load_state_dict(checkpoint["weights"])
     except RuntimeError as error:

@@ -1,9 +1,14 @@
-"""The network of Table S1: a bidirectional LSTM that runs over the modules of the robot, not over time."""
+"""The three networks of Table S1. All take the same features of a window and give the same actuation, so that training,
+evaluation and the control loop are the same code for each."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import nn
+
+from modsoft.runtime.errors import ModelError
 
 
 class BiLSTM(nn.Module):
@@ -24,3 +29,81 @@ class BiLSTM(nn.Module):
         """features (B, N, F) -> actuation (B, N, A); module index 0 nearest the base."""
         hidden, _ = self.lstm(features)  # (B, N, 2 H)
         return self.head(hidden)
+
+
+class LSTM(nn.Module):
+    """All modules in one unit: the sequence is time, an element of it the states and actions of all modules in one
+    slot of the window, and the actuation comes out after the last. Bound to its number of modules, so without label.
+
+    Table S1 ("LSTM"): 4 layers of hidden size 128.
+    """
+
+    def __init__(
+        self,
+        modules: int,
+        history: int,
+        feature_size: int,
+        action_size: int,
+        layers: int = 4,
+        hidden: int = 128,
+        dropout: float = 0.1,
+    ):
+        super().__init__()
+        self.module_number, self.history, self.feature_size = modules, history, feature_size
+        slot_size = (feature_size - 1) // history  # S + A
+        self.lstm = nn.LSTM(
+            modules * slot_size, hidden, layers, batch_first=True, dropout=dropout if layers > 1 else 0.0
+        )
+        self.head = nn.Linear(hidden, modules * action_size)
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """features (B, N, F) -> actuation (B, N, A); `ModelError` for another number of modules."""
+        if features.shape[1:] != (self.module_number, self.feature_size):
+            raise ModelError(
+                f"features of {features.shape[1]} modules, {features.shape[2]} each: this network was trained for "
+                f"{self.module_number} modules with {self.feature_size} and serves no other robot; the biLSTM does"
+            )
+        slots = features[..., :-1].unflatten(-1, (self.history, -1))  # (B, N, T, S + A)
+        hidden, _ = self.lstm(slots.transpose(1, 2).flatten(2))  # (B, T, H)
+        return self.head(hidden[:, -1]).unflatten(-1, (self.module_number, -1))
+
+
+class ModuleLSTM(nn.Module):
+    """One network a module, each with weights of its own and told nothing of the others: the sequence is time, an
+    element of it the module's own states and actions in one slot. Bound to its number of modules.
+
+    Table S1 ("four LSTM"): 4 layers of hidden size 128 each. A loop over the networks: torch's fused LSTM is twice as
+    fast on a processor as one batched product for all of them.
+    """
+
+    def __init__(self, modules: int, history: int, feature_size: int, *sizes: Any):
+        super().__init__()
+        self.networks = nn.ModuleList(LSTM(1, history, feature_size, *sizes) for _ in range(modules))
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """features (B, N, F) -> actuation (B, N, A); `ModelError` for another number of modules."""
+        if features.shape[1] != len(self.networks):
+            raise ModelError(
+                f"features of {features.shape[1]} modules: this network was trained for {len(self.networks)} modules "
+                "and serves no other robot; the biLSTM does"
+            )
+        own = [network(features[:, i : i + 1]) for i, network in enumerate(self.networks)]
+        return torch.cat(own, dim=1)
+
+
+NETWORKS = ("bilstm", "lstm", "module-lstm")
+
+
+def build(description: dict[str, Any]) -> nn.Module:
+    """The network, with random weights, that a checkpoint's `network` describes; `ModelError` for an unknown name."""
+    name = description["name"]
+    sizes = [description[key] for key in ("feature_size", "action_size", "layers", "hidden")]
+    sizes.append(description.get("dropout", 0.0))
+    if name == "bilstm":
+        return BiLSTM(*sizes)
+    if name not in NETWORKS:
+        raise ModelError(f"network {name!r}, expected one of {', '.join(NETWORKS)}; train it again with this version")
+    if "modules" not in description:
+        raise ModelError(f"network {name!r} without its number of modules; train it again with this version")
+    network = LSTM if name == "lstm" else ModuleLSTM
+    return network(description["modules"], description["history"], *sizes)

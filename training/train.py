@@ -1,4 +1,4 @@
-"""Training the biLSTM of Table S1: one loop, read from top to bottom, that can be killed at any time.
+"""Training the networks of Table S1: one loop, read from top to bottom, that can be killed at any time.
 
 `OUT.resume` beside the model holds all that the loop needs to go on; a run that was cut anywhere ends with the same
 weights, bit for bit, as one that was not (with the same number of threads on the same machine, and no time budget).
@@ -19,11 +19,11 @@ import numpy as np
 import torch
 
 from modsoft.runtime.configuration import feature_names, labels
-from modsoft.runtime.errors import ModelError
+from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.files import check_writable
 from modsoft.training import checkpoint as checkpoints
+from modsoft.training import networks
 from modsoft.training.dataset import DataSet, Windows, split
-from modsoft.training.networks import BiLSTM
 
 # What suits a kind of robot: history and batch of Table S1. A hanging robot's last modules hang from a module that
 # hardly moves beside them, so that they are as good as a robot of their own; with the cable robot nothing was gained by
@@ -42,6 +42,7 @@ class Settings:
     """What the weights depend on, together with the data."""
 
     history: int  # T
+    network: str = "bilstm"  # one of networks.NETWORKS
     batch: int = 64
     shorter: float = 0.0  # share of the steps that take the robot's last modules for a robot of their own
     iterations: int = 6000
@@ -53,6 +54,10 @@ class Settings:
     split: str = "blocks"
     seed: int = 0
     threads: int = 1
+
+    def __post_init__(self) -> None:
+        if self.network != "bilstm" and self.shorter:
+            raise UsageError(f"--shorter {self.shorter}: the network {self.network} is bound to its number of modules")
 
 
 class Progress(NamedTuple):
@@ -94,7 +99,18 @@ def train(
     torch.manual_seed(settings.seed)
     training, validation, test = split(data, settings.history, settings.split, settings.seed)
     features, actions = training.features.shape[-1], training.targets.shape[-1]
-    network = BiLSTM(features, actions, settings.layers, settings.hidden, settings.dropout)
+    described: dict[str, Any] = {
+        "name": settings.network,
+        "feature_size": features,
+        "action_size": actions,
+        "layers": settings.layers,
+        "hidden": settings.hidden,
+        "dropout": settings.dropout,
+        "history": settings.history,
+    }
+    if settings.network != "bilstm":
+        described["modules"] = data.robot.modules
+    network = networks.build(described)
     identity = {"data_sha256": data.sha256(), **asdict(settings)}
     resume = out.with_name(f"{out.name}.resume")
     check_writable(out)
@@ -115,15 +131,7 @@ def train(
     checkpoint = {
         "schema": checkpoints.SCHEMA,
         "robot": data.recipe["robot"],
-        "network": {
-            "name": "bilstm",
-            "feature_size": features,
-            "action_size": actions,
-            "layers": settings.layers,
-            "hidden": settings.hidden,
-            "dropout": settings.dropout,
-            "history": settings.history,
-        },
+        "network": described,
         "features": feature_names(data.robot.robot.kind, settings.history),
         "weights": state["best"],
         "provenance": {
@@ -149,7 +157,7 @@ def train(
 
 
 def _fit(
-    network: BiLSTM,
+    network: torch.nn.Module,
     training: Windows,
     validation: Windows,
     settings: Settings,

@@ -18,6 +18,12 @@ from modsoft.runtime.files import check_writable
 @click.command("modsoft-train", context_settings={"show_default": True})
 @click.argument("data_file", metavar="DATASET", type=click.Path(path_type=Path))
 @click.option("--out", default="model.pt", type=click.Path(path_type=Path, dir_okay=False), help="Model to make.")
+@click.option(
+    "--network",
+    default="bilstm",
+    type=click.Choice(["bilstm", "lstm", "module-lstm"]),
+    help="bilstm serves any number of modules; lstm (all modules in one) and module-lstm (one each) only the data's.",
+)
 @click.option("--iterations", default=6000, type=click.IntRange(1), help="Steps of the optimiser.")
 @click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Time that ends the run if it is first.")
 @click.option("--batch", type=click.IntRange(1), help="Windows in a step.  [default: 64 cable, 128 pneumatic]")
@@ -26,7 +32,8 @@ from modsoft.runtime.files import check_writable
 @click.option(
     "--shorter",
     type=click.FloatRange(0, 1),
-    help="Share of the steps that take the last modules for a shorter robot.  [default: 0 cable, 0.4 pneumatic]",
+    help="Share of the steps that take the last modules for a shorter robot; bilstm only.  "
+    "[default: 0 cable, 0.4 pneumatic]",
 )
 @click.option("--history", type=click.IntRange(1), help="Time steps T.  [default: 5 cable, 10 pneumatic]")
 @click.option(
@@ -38,7 +45,7 @@ from modsoft.runtime.files import check_writable
 @click.option("--seed", default=0, type=click.IntRange(0), help="The same seed gives the same model.")
 @click.option("--threads", default=1, type=click.IntRange(1), help="Cores; more than are free is far slower than one.")
 def cli(data_file: Path, out: Path, **options: Any) -> None:
-    """Train the bidirectional LSTM of the paper's Table S1 on a DATASET of modsoft-collect.
+    """Train a network of the paper's Table S1, by default the bidirectional LSTM, on a DATASET of modsoft-collect.
 
     \b
     Example:
@@ -59,7 +66,10 @@ def cli(data_file: Path, out: Path, **options: Any) -> None:
 
     data = dataset.read(data_file)
     told = {name: value for name, value in options.items() if value is not None}
-    settings = train.Settings(**{**train.BY_KIND[data.robot.robot.kind], **told})
+    suited = train.BY_KIND[data.robot.robot.kind]
+    if options["network"] != "bilstm":
+        suited = {**suited, "shorter": 0.0}
+    settings = train.Settings(**{**suited, **told})
     began_s, first, smooth = time.monotonic(), None, 0.0
     with tqdm(total=100, desc="train", bar_format="{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}") as bar:
 

@@ -9,7 +9,7 @@ import torch
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import feature_names, from_angles_deg
-from modsoft.runtime.errors import ModelError
+from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import dataset, train
 
@@ -58,6 +58,26 @@ def test_it_learns_and_the_checkpoint_says_all(tmp_path):
     assert [t.iteration for t in told] == list(range(1, 601))
     assert told[-1].share == 1.0
     assert np.mean([t.loss for t in told[-50:]]) < 0.05 * told[0].loss
+
+
+@pytest.mark.parametrize("network", ["lstm", "module-lstm"])
+def test_the_networks_bound_to_a_module_number_learn_too(tmp_path, network):
+    data = make(20)
+    settings = dataclasses.replace(SMALL, network=network, iterations=600, rate=0.01, dropout=0.0)
+    found = train.train(data, tmp_path / "model.pt", settings)
+    assert (found["network"]["name"], found["network"]["modules"]) == (network, 3)
+    assert found["provenance"]["network"] == network
+    # 25 percent is a guess. A module's own angle hides up to 10 of 40 degrees of its neighbour's doing.
+    assert max(found["provenance"]["errors_percent"]) < (5.0 if network == "lstm" else 15.0)
+    again = checkpoints.network_of(checkpoints.load(tmp_path / "model.pt"))
+    _, _, test = dataset.split(data, 3, "blocks", 0)
+    errors = train.estimation_errors(again, test).mean(dim=(0, 2))
+    np.testing.assert_allclose(errors.numpy(), found["provenance"]["errors_percent"], atol=1e-3)
+
+
+def test_a_network_bound_to_a_module_number_has_no_shorter_robots():
+    with pytest.raises(UsageError, match=r"--shorter 0\.4: the network lstm is bound"):
+        dataclasses.replace(SMALL, network="lstm", shorter=0.4)
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):

@@ -13,7 +13,7 @@ import torch
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import from_angles_deg
 from modsoft.training import checkpoint as checkpoints
-from modsoft.training import dataset
+from modsoft.training import dataset, networks, train_cli
 
 QUICK = ["--iterations", "60", "--history", "3", "--batch", "8"]
 
@@ -58,6 +58,15 @@ def test_killed_and_started_again_it_ends_with_the_same_model(folder):
     assert not resume.exists()
 
 
+def test_the_network_asked_for_is_trained(folder):
+    found = run(folder, "d.h5", "--out", "m.pt", "--network", "lstm", *QUICK)
+    assert found.returncode == 0, found.stderr
+    made = checkpoints.load(folder / "m.pt")
+    assert (made["network"]["name"], made["provenance"]["shorter"]) == ("lstm", 0.0)
+    choice = next(option for option in train_cli.cli.params if option.name == "network").type
+    assert tuple(choice.choices) == networks.NETWORKS
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
@@ -67,6 +76,7 @@ def test_killed_and_started_again_it_ends_with_the_same_model(folder):
         (["d.h5", "--minutes", "0"], 2, "minutes"),
         (["d.h5", "--minutes", "nan"], 2, "minutes"),
         (["d.h5", "--out", "."], 2, "."),
+        (["d.h5", "--network", "module-lstm", "--shorter", "0.4"], 2, "bound to its number of modules"),
         ([], 2, "DATASET"),
     ],
 )
