@@ -96,6 +96,8 @@ def _somebody_there() -> bool:
               help="edge, down, or a .npy file of desired configurations (steps, modules, 3). [default: task under "
                    "[loop] in the robot file]")  # fmt: skip
 @click.option("--steps", type=click.IntRange(1), metavar="N", help="Stop after the first N control steps.")
+@click.option("--correction", default="none", show_default=True, type=click.Choice(["none", "integral"]),
+              help="integral: the accumulated configuration error shifts what the model is asked for.")  # fmt: skip
 @click.option("--tracker", type=click.Choice(["ndi", "replay"]), metavar="ndi|replay",
               help="Where frames come from. [default: source under [tracker] in the robot file]")  # fmt: skip
 @click.option("--tracker-port", default="", metavar="PORT",

@@ -12,7 +12,9 @@ that the loop never waits for a disk and a killed process loses nothing. A tick:
     frame                 null, or number (the device's), mono_ns (before it was asked), age_ms, poses (N + 1, 4, 4) in
                           mm, valid (N + 1), quality (N + 1)
     configuration         (N, 3) measured at the start of this step, [v_x, v_y, v_z]; null without a good frame
-    desired               (N, 3) what this step aims at
+    desired               (N, 3) what is desired at the start of this step
+    aim                   (N, 3) what the model is asked for: what is desired at the start of the next step, shifted by
+                          the correction; null without a good frame
     raw                   (N, A) the model's answer; null without a good frame
     actuation             (N, A) after every limit: what was sent
     commanded_bar         (channels) set-points that were sent

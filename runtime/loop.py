@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from modsoft.runtime.actuation import channel_pressures_bar, limited
 from modsoft.runtime.clock import Tick, Ticker
 from modsoft.runtime.configuration import Window, state_of
+from modsoft.runtime.correction import Correction, NoCorrection
 from modsoft.runtime.errors import LostInRun
 from modsoft.runtime.protocol import CHANNELS, State, Status
 from modsoft.runtime.robot import Robot
@@ -20,6 +21,7 @@ from modsoft.runtime.safety import FrameJudge, Guard, Judgement, check_actuation
 from modsoft.runtime.stop import Stop
 from modsoft.runtime.tally import Tally
 from modsoft.runtime.tracker import Frame, Slot
+from modsoft.runtime.trajectory import ahead
 
 Array = NDArray[np.float64]
 
@@ -54,7 +56,8 @@ class Valves(Protocol):
 
 @dataclass(frozen=True)
 class Loop:
-    """What a run consists of. `desired` (K, N, 3): configurations, row k is what step k aims at."""
+    """What a run consists of. `desired` (K, N, 3): configurations at the start of each step; step k asks the
+    model for row k + 1, and the error counts where the robot is at the start of step k. `correction`: a new one."""
 
     robot: Robot
     model: Model
@@ -66,6 +69,7 @@ class Loop:
     stop: Stop
     log: Callable[[dict[str, Any]], None]
     tally: Tally
+    correction: Correction = field(default_factory=NoCorrection)
 
     def run(self, rest: Array) -> None:
         """Runs the whole task from `rest` (N, 3), the configuration of the vented robot; the board is armed.
@@ -84,7 +88,7 @@ class Loop:
         sequence: int | None = self.valves.set_pressures(0, bar)
         self.ticker.start(robot.loop.period_s)
         self.log({"event": "start", "mono_ns": began_ns, "commanded_bar": bar})
-        step = -1
+        targets, step = ahead(self.desired), -1
         while True:
             tick = self.ticker.next(self._idle)
             acknowledged = self._acknowledged(step, sequence)
@@ -100,7 +104,7 @@ class Loop:
             judged = self.judge.judge(frame, self.ticker.now())
             desired = self.desired[step]
             line = self._begun(tick, frame, judged, desired, acknowledged)
-            line |= {"sent": False, "raw": None, "actuation": applied, "commanded_bar": None}
+            line |= {"sent": False, "aim": None, "raw": None, "actuation": applied, "commanded_bar": None}
             try:
                 guard.frame(judged)
                 actuation = applied  # held where there is no good frame
@@ -108,9 +112,11 @@ class Loop:
                     state = state_of(judged.configuration, kind)
                 window.observe(state)
                 if judged.configuration is not None:
-                    line["raw"] = raw = self.model.actuate(window.features(state_of(desired, kind)))
+                    line["aim"] = aim = self.correction.aim(targets[step], desired, judged.configuration)
+                    line["raw"] = raw = self.model.actuate(window.features(state_of(aim, kind)))
                     check_actuation(raw)
                     actuation = limited(raw, applied, robot.limits.largest_actuation_step)
+                    self.correction.answered(raw, actuation)
                 bar = channel_pressures_bar(robot, actuation, CHANNELS)
                 if not self.ticker.too_late(step):
                     sequence = self.valves.set_pressures(step + 1, bar)

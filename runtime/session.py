@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from modsoft.runtime import correction
 from modsoft.runtime import log as logs
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board import Board
@@ -60,6 +61,7 @@ class Options:
     robot: str
     model: Path
     task: str
+    correction: str
     port: str
     tracker: str
     tracker_port: str
@@ -102,6 +104,7 @@ def run(options: Options) -> None:
         controller.warm_up(robot.modules)
         _say(f"robot {robot.name}, {robot.modules} modules, hangs at {_angles(rest)} degrees")
         _say(f"model {options.model}, task {task}: {len(desired)} steps, {len(desired) * robot.loop.period_s:.0f} s")
+        _say(f"correction {options.correction}")
 
         board = None
         if not options.dry_run:
@@ -113,6 +116,7 @@ def run(options: Options) -> None:
         tally = Tally(robot, len(desired))
         log = logs.RunLog(options.runs, robot.name, robot_text, {
             "command": sys.argv[1:], "robot": robot.to_dict(), "task": task, "steps": len(desired),
+            "correction": options.correction,
             "model": {"file": str(options.model), "sha256": digest, "description": _described(controller)},
             "board": None if board is None else board.hello._asdict(), "port": port or None,
         })  # fmt: skip
@@ -128,6 +132,7 @@ def run(options: Options) -> None:
                 Loop(
                     robot, controller, desired, slot, judge, board or Rehearsal(),
                     Ticker(robot.loop.period_s, time.monotonic, stop.wait), stop, log.put, tally,
+                    correction.named(options.correction, robot.modules),
                 ).run(rest)  # fmt: skip
         except BaseException as raised:  # noqa: BLE001 - raised again below, after the venting
             error = raised

@@ -64,6 +64,12 @@ def task_planar(largest_deg: list[float]) -> Array:
     return from_angles_deg(share[:, None] * np.asarray(largest_deg))
 
 
+def ahead(desired: Array) -> Array:
+    """What the network is asked for at each step (K, N, 3): S_d of eq. (1) is the state at the end of the period, which
+    is desired at the start of the next. The last period ends where the task does."""
+    return np.concatenate([desired[1:], desired[-1:]])
+
+
 def available(kind: str, modules: int) -> list[str]:
     """Names of the tasks that the supplement defines for such a robot."""
     if kind == "cable":
@@ -72,7 +78,7 @@ def available(kind: str, modules: int) -> list[str]:
 
 
 def task(name: str, kind: str, modules: int) -> Array:
-    """Desired configurations (steps, N, 3), [v_x, v_y, v_z]; row k is the target of control step k."""
+    """Desired configurations (steps, N, 3), [v_x, v_y, v_z]; row k is the target at the start of control step k."""
     if name not in available(kind, modules):
         known = ", ".join(available(kind, modules)) or "none by name"
         raise UsageError(

@@ -1,9 +1,10 @@
-"""What a controller is worth: the simulated robot in closed loop, and its distance from what was desired."""
+"""What a controller is worth: simulated robots in closed loop, and their distance from what was desired."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,33 +12,76 @@ from numpy.typing import NDArray
 
 from modsoft.runtime.actuation import limited
 from modsoft.runtime.configuration import Window, bending_error_deg, state_of
+from modsoft.runtime.correction import Correction, NoCorrection
 from modsoft.runtime.robot import Robot
+from modsoft.runtime.trajectory import ahead
 from modsoft.training.checkpoint import network_of
+from modsoft.training.fleet import Arms, Fleet
 
 Array = NDArray[np.float64]
 Actuate = Callable[[Array], Array]
+Measure = Callable[[int, Array], Array | None]
 
 
-def closed_loop(robot: Robot, arm: Any, actuate: Actuate, history: int, desired: Array) -> tuple[Array, Array]:
-    """Drives `arm` (`modsoft.training.arm.Arm`, at rest) along `desired` (K, N, 3) as the runtime would.
+def exactly(step: int, configuration: Array) -> Array | None:
+    """A tracker without fault."""
+    return configuration
 
-    actuate: features (N, F) -> actuation (N, A). At step k it is given desired[k], as the state to be reached at the
-    end of the period. Returns configurations (K + 1, N, 3) at the start of every period and after the last, and the
-    actions applied (K, N, A).
+
+@dataclass
+class Pilot:
+    """Who drives one robot of a fleet through one task.
+
+    actuate: features (N, F) -> actuation (N, A); desired (K, N, 3): configurations at the start of each period.
+    measure: (step, true configuration (N, 3)) -> what the tracker says, or None for a lost frame, on which the runtime
+    holds the action and remembers the state before.
     """
-    kind = robot.robot.kind
-    configuration = [arm.configuration]
-    actions = np.zeros((len(desired), robot.modules, robot.action_size))
-    window = Window(history, state_of(configuration[0], kind), robot.action_size)
-    previous = np.zeros_like(actions[0])
-    for k, target in enumerate(desired):
-        window.observe(state_of(configuration[-1], kind))
-        raw = actuate(window.features(state_of(target, kind)))
-        previous = actions[k] = limited(raw, previous, robot.limits.largest_actuation_step)
-        window.applied(actions[k])
-        arm.step(actions[k], robot.loop.period_s)
-        configuration.append(arm.configuration)
-    return np.stack(configuration), actions
+
+    actuate: Actuate
+    history: int
+    desired: Array
+    correction: Correction = field(default_factory=NoCorrection)
+    measure: Measure = exactly
+
+
+class Flight(NamedTuple):
+    """What one robot did: at the start of every period and after the last, and the actions that were applied."""
+
+    configuration: Array  # (K + 1, N, 3)
+    actions: Array  # (K, N, A)
+    positions: Array  # (K + 1, N, 3), m, of the module ends
+    directors: Array  # (K + 1, N, 3, 3), rows d1, d2, d3 in the lab frame
+
+
+def fly(robot: Robot, robots: Fleet | Arms, pilots: Sequence[Pilot]) -> list[Flight]:
+    """Drives `robots`, at rest, each by its own pilot as the runtime would (`modsoft.runtime.loop`): at step k the
+    network is asked for desired[k + 1], the state at the end of the period. All tasks have the same length K."""
+    kind, steps = robot.robot.kind, len(pilots[0].desired)
+    if len(pilots) != robots.count or any(len(pilot.desired) != steps for pilot in pilots):
+        raise ValueError(f"{len(pilots)} pilots for {robots.count} robots; expected one each, of tasks of one length")
+    actions = np.zeros((steps, len(pilots), robot.modules, robot.action_size))
+    told = [(robots.configuration, robots.positions, robots.directors)]
+    state = [state_of(configuration, kind) for configuration in told[0][0]]
+    windows = [Window(pilot.history, at_rest, robot.action_size) for pilot, at_rest in zip(pilots, state, strict=True)]
+    targets = [ahead(pilot.desired) for pilot in pilots]
+    for k in range(steps):
+        for b, pilot in enumerate(pilots):
+            before = actions[k - 1, b] if k else np.zeros_like(actions[k, b])
+            measured = pilot.measure(k, told[-1][0][b])
+            if measured is not None:
+                state[b] = state_of(measured, kind)
+            windows[b].observe(state[b])
+            actions[k, b] = before
+            if measured is not None:
+                aim = pilot.correction.aim(targets[b][k], pilot.desired[k], measured)
+                raw = pilot.actuate(windows[b].features(state_of(aim, kind)))
+                actions[k, b] = limited(raw, before, robot.limits.largest_actuation_step)
+                pilot.correction.answered(raw, actions[k, b])
+            windows[b].applied(actions[k, b])
+        robots.step(actions[k], robot.loop.period_s)
+        told.append((robots.configuration, robots.positions, robots.directors))
+    configuration, positions, directors = (np.stack(values, axis=1) for values in zip(*told, strict=True))
+    return [Flight(configuration[b], actions[:, b], positions[b], directors[b]) for b in range(len(pilots))]
 
 
 def actuate_with(checkpoint: dict[str, Any]) -> Actuate:
@@ -52,9 +96,8 @@ def actuate_with(checkpoint: dict[str, Any]) -> Actuate:
 
 
 def angle_errors_deg(configuration: Array, desired: Array) -> Array:
-    """|bending angle - desired bending angle| (K, N), degrees, of a planar robot: configuration measured at the start
-    of period k against the desired one of step k, as the paper counts it. A controller that reaches every desired
-    configuration exactly, one period later, is still charged with what the task moves in a period."""
+    """|bending angle - desired bending angle| (K, N), degrees, of a planar robot: configuration (K + 1, N, 3) at the
+    start of period k against the desired one of step k, as the paper counts it."""
     return bending_error_deg(configuration[: len(desired)], desired)
 
 

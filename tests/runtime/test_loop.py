@@ -163,9 +163,9 @@ def test_the_model_gets_the_window_that_training_makes():
     window = Window(3, state_of(REST, "pneumatic"), 1)
     for k, given_features in enumerate(world.features):
         window.observe(state_of(world.ticks[k]["configuration"], "pneumatic"))
-        np.testing.assert_allclose(
-            given_features, window.features(state_of(world.loop.desired[k], "pneumatic")), atol=1e-12
-        )
+        # asked for is the state at the end of the period, which is desired at the start of the next
+        due = world.loop.desired[min(k + 1, 5)]
+        np.testing.assert_allclose(given_features, window.features(state_of(due, "pneumatic")), atol=1e-12)
         window.applied(world.ticks[k]["actuation"])
 
 

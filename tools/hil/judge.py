@@ -145,8 +145,7 @@ def p99(values: Array) -> float:
 
 
 def tracking_error_deg(record: Record) -> Array:
-    """|bending angle measured at the start of tick k - desired angle of tick k|, (K, N): the paper's convention, which
-    charges the controller with the one period that every action needs to act."""
+    """|bending angle measured at the start of tick k - desired angle of tick k|, (K, N): the paper's convention."""
     return bending_error_deg(record.configuration, record.desired)
 
 

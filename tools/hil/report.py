@@ -18,7 +18,7 @@ from modsoft.hil.judge import (
     tracking_error_deg,
     valve_difference,
 )
-from modsoft.runtime.configuration import angle_between_deg, bending_angle_deg, bending_error_deg
+from modsoft.runtime.configuration import angle_between_deg, bending_angle_deg
 from modsoft.runtime.tally import spread
 
 CLOCKS = (
@@ -50,12 +50,9 @@ def figures(record: Record) -> dict[str, Any]:
     }
     if len(record.tick) and len(record.plant_mono_ns) > 1:
         error, off = tracking_error_deg(record), measured_off_deg(record)
-        # the state that tick k asked for is due at the start of tick k + 1
-        due = bending_error_deg(record.configuration[1:], record.desired[:-1])
         apart = 100.0 * np.linalg.norm(record.configuration - record.desired, axis=-1)
         figure |= {
             "tracking_error_deg": _by_module(error),
-            "tracking_error_one_tick_later_deg": _by_module(due),
             "tracking_error_percent": _by_module(apart),
             "out_of_plane_deg": _by_module(_out_of_plane_deg(record)),
             "measured_off_plant_deg": spread(list(off[np.isfinite(off)])),
@@ -116,8 +113,7 @@ def _row(line: Acceptance, void: bool) -> str:
 def _tracking_table(found: dict[str, Any]) -> list[str]:
     """Tracking errors by module, mean ± standard deviation, and the largest."""
     rows = {
-        "against the target of the same tick, °": "tracking_error_deg",
-        "against the target of the tick before, °": "tracking_error_one_tick_later_deg",
+        "bending angle, °": "tracking_error_deg",
         "distance of the unit vectors, %": "tracking_error_percent",
     }
     modules = range(1, len(found["tracking_error_deg"]["mean"]) + 1)
