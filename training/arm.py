@@ -6,6 +6,8 @@ from `loads.add_loads`, one compiled call a time step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import elastica
 import numpy as np
 from numpy.typing import NDArray
@@ -77,16 +79,20 @@ class Arm:
     """A robot of `modules` modules of one kind (`cable` or `pneumatic`), starting at rest at activation 0.
 
     kind: a key of `robots.PLANTS`. Activation 0 of a pneumatic arm is its lower pressure, not a vented chamber. A wrong
-    shape, an actuation outside [-1, 1] or pressures on a cable robot raise ValueError.
+    shape, an actuation outside [-1, 1] or pressures on a cable robot raise ValueError. stiffness, tip_payload_kg: as
+    in `fleet.Fleet`.
 
     A pneumatic arm is simulated as a rod in space too, loads and start in the x-z plane: its motion then stays in the
     plane by itself, exactly, because every force out of it is a sum of zeros.
     """
 
-    def __init__(self, kind: str, modules: int) -> None:
+    def __init__(
+        self, kind: str, modules: int, *, stiffness: Sequence[float] | Array | None = None, tip_payload_kg: float = 0.0
+    ) -> None:
         self.kind = kind
-        self.plant = PLANTS[kind]
+        self.plant = PLANTS[kind].carrying(tip_payload_kg)
         self.modules = modules
+        self._stiffness = self.plant.stiffness_ratios(modules, stiffness)
         self._time_s = np.float64(0.0)
         self._owed_s = 0.0
         self._build()
@@ -176,7 +182,8 @@ class Arm:
             youngs_modulus=plant.youngs_modulus_pa,
         )
         rod.shear_matrix[2, 2] *= plant.axial_ratio
-        rod.bend_matrix *= plant.bend_ratios(self.modules)
+        rod.shear_matrix *= self._stiffness
+        rod.bend_matrix *= plant.bend_ratios(self._stiffness)
         rod.mass_second_moment_of_inertia *= plant.rotary_inertia_ratio
         rod.inv_mass_second_moment_of_inertia /= plant.rotary_inertia_ratio
         rod.mass[plant.elements :: plant.elements] += plant.connector_mass_kg

@@ -10,7 +10,8 @@
 
 enum { MOST_ACTUATORS = 4 };
 
-/* One kind of robot, SI units; every element of the rod is alike. fleet.py fills it in, field by field. */
+/* One kind of robot, SI units; what makes its elements unlike stands in the three arrays. fleet.py fills it in, field by
+ * field. */
 struct plant {
     int64_t actuators;            /* that act on a module at a time */
     int64_t axis[MOST_ACTUATORS]; /* 0 or 1: the director that each of them stands along */
@@ -31,6 +32,9 @@ struct plant {
     double gyration[3];         /* time step of the rotational kick, s, of each axis */
     double turn_kick[3];        /* rad/s for a torque of 1 N m */
     double fade_kick[3];        /* damping of the rotation, of a length of 1 m */
+    const double *mobility;     /* (elements + 1): time step over the mass of a node, s/kg */
+    const double *stiffness;    /* (elements): of shear and stretch, over that of the kind */
+    const double *rigidity;     /* (elements - 1): of bend and twist in a Voronoi domain, likewise */
 };
 
 /* Elements a stage stays behind the first one, so that the stages of one turn of the loop do not wait for each other
@@ -98,21 +102,19 @@ int fleet_plant_bytes(void) { return (int)sizeof(struct plant); }
 
 /* Advances `blocks` blocks of robots of `modules` modules by `steps` time steps.
  *
- * mobility (elements + 1): time step over the mass of a node, s/kg.
- * rigidity (elements - 1): of a Voronoi domain, over that of the others of its kind.
  * drive (blocks, modules, actuators, 4, lanes): struct drive.
  * state (blocks, elements + 1, 20, lanes): struct element, k beside the node before it; the last node has no element.
  * Both start on a multiple of 8 * lanes bytes.
  */
 void fleet_advance(int variant, const struct plant *plant, int blocks, int modules, int per_module,
-                   const double *mobility, const double *rigidity, double *drive, double *state, long steps)
+                   double *drive, double *state, long steps)
 {
     for (int b = 0; b < blocks; b++) {
         switch (variant) {
-        case 0: advance_plain(plant, b, modules, per_module, mobility, rigidity, drive, state, steps); break;
+        case 0: advance_plain(plant, b, modules, per_module, drive, state, steps); break;
 #if defined(__x86_64__)
-        case 1: advance_avx2(plant, b, modules, per_module, mobility, rigidity, drive, state, steps); break;
-        case 2: advance_avx512(plant, b, modules, per_module, mobility, rigidity, drive, state, steps); break;
+        case 1: advance_avx2(plant, b, modules, per_module, drive, state, steps); break;
+        case 2: advance_avx512(plant, b, modules, per_module, drive, state, steps); break;
 #endif
         }
     }

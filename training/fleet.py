@@ -12,6 +12,7 @@ import math
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,13 @@ def _aligned(shape: tuple[int, ...]) -> Array:
     return buffer[start : start + size].reshape(shape)
 
 
+class Snapshot(NamedTuple):
+    """The robots of a fleet at one moment, robot first."""
+
+    state: Array  # (B, elements + 1, 20)
+    drive: Array  # (B, N, actuators, 4)
+
+
 class Fleet:
     """`count` robots of one kind and one module number, starting at rest at activation 0.
 
@@ -48,6 +56,9 @@ class Fleet:
     after the jump from rest that task B begins with.
 
     threads: work on that many blocks of robots (of `lanes` each) at a time; the numbers stay the same.
+
+    stiffness (N,): factors on each module's bending, twisting, shear and stretching stiffness, 1 by default.
+    tip_payload_kg: a point mass at the last node, with its weight. All robots of a fleet are alike.
     """
 
     def __init__(
@@ -60,6 +71,8 @@ class Fleet:
         time_step_s: float | None = None,
         threads: int = 1,
         variant: str | None = None,
+        stiffness: Sequence[float] | Array | None = None,
+        tip_payload_kg: float = 0.0,
     ) -> None:
         library, runnable = kernel.library(), kernel.variants()
         if library is None:
@@ -71,9 +84,8 @@ class Fleet:
         self._library = library
         self.lanes: int = library.fleet_lanes(self._variant)
         self.kind, self.modules, self.count, self.damping = kind, modules, count, damping
-        self.plant = PLANTS[kind]
+        self.plant = PLANTS[kind].carrying(tip_payload_kg)
         self.time_step_s = self.plant.time_step_s if time_step_s is None else time_step_s
-        self._constants = kernel.constants(self.plant, damping, self.time_step_s)
         self._alternate = kernel.alternate(self.plant)
         self._places = np.array(kernel.places(self.plant)[1])
         elements = modules * self.plant.elements
@@ -83,7 +95,9 @@ class Fleet:
         mass[self.plant.elements :: self.plant.elements] += self.plant.connector_mass_kg
         mass[-1] += self.plant.tip_mass_kg - self.plant.connector_mass_kg
         self._mobility = self.time_step_s / mass
-        self._rigidity = np.ascontiguousarray(self.plant.bend_ratios(modules))
+        self._stiffness = self.plant.stiffness_ratios(modules, stiffness)
+        self._rigidity = self.plant.bend_ratios(self._stiffness)
+        self._constants = self._with_arrays(damping)
         # Newtons of a pascal at weight 1.
         self._section_m2 = self.plant.actuators.area_ratio * area
         self._threads = ThreadPoolExecutor(threads) if threads > 1 else None
@@ -118,11 +132,19 @@ class Fleet:
 
     def reset(self, indices: Sequence[int] | NDArray[np.integer] | None = None) -> None:
         """Robots `indices` (all by default) back to rest; the others go on."""
-        every = np.arange(self._state.shape[0] * self.lanes) if indices is None else np.asarray(indices)
-        block, lane = np.divmod(every, self.lanes)
-        state, drive = self._rest
-        self._state[block, :, :, lane] = state
-        self._drive[block, :, :, :, lane] = drive
+        self.restore(self._rest, np.arange(self._state.shape[0] * self.lanes) if indices is None else indices)
+
+    def snapshot(self, indices: Sequence[int] | NDArray[np.integer] | None = None) -> Snapshot:
+        """Everything that the motion of robots `indices` (all by default) depends on, to go on from there later."""
+        block, lane = np.divmod(np.arange(self.count) if indices is None else np.asarray(indices), self.lanes)
+        return Snapshot(self._state[block, :, :, lane], self._drive[block, :, :, :, lane])
+
+    def restore(self, snapshot: Snapshot, indices: Sequence[int] | NDArray[np.integer] | None = None) -> None:
+        """Puts robots `indices` (all by default) where `snapshot` was taken, one of it each; a snapshot of one robot
+        goes to all of them."""
+        block, lane = np.divmod(np.arange(self.count) if indices is None else np.asarray(indices), self.lanes)
+        self._state[block, :, :, lane] = snapshot.state
+        self._drive[block, :, :, :, lane] = snapshot.drive
 
     def step(self, actuation: Array, period_s: float | None = None) -> None:
         """One control period (the plant's own by default) of `actuation` (B, N, A) in [-1, 1]."""
@@ -138,6 +160,13 @@ class Fleet:
     def run(self, actions: Array) -> Array:
         """Applies actions (K, B, N, A), a control period each; configurations (K + 1, B, N, 3)."""
         return _run(self, actions)
+
+    def _with_arrays(self, damping: Damping) -> kernel.PlantStruct:
+        plant = kernel.constants(self.plant, damping, self.time_step_s)
+        plant.mobility = self._mobility.ctypes.data
+        plant.stiffness = self._stiffness.ctypes.data
+        plant.rigidity = self._rigidity.ctypes.data
+        return plant
 
     def _set(self, drive: Array, actuation: Array) -> None:
         """Eq. (3), stress and force, and where each actuator stands, into the lanes of `drive`."""
@@ -159,14 +188,14 @@ class Fleet:
             raise ValueError(f"{duration_s} s is not a whole number of time steps of {self.time_step_s} s")
 
         def advance(block: slice) -> None:
-            arrays = (self._mobility, self._rigidity, drive[block], state[block])
             self._library.fleet_advance(
                 self._variant,
                 ctypes.byref(plant),
                 len(state[block]),
                 self.modules,
                 self.plant.elements,
-                *(array.ctypes.data for array in arrays),
+                drive[block].ctypes.data,
+                state[block].ctypes.data,
                 steps,
             )
 
@@ -175,8 +204,8 @@ class Fleet:
         else:
             list(self._threads.map(advance, [slice(block, block + 1) for block in range(len(state))]))
 
-    def _settled(self) -> tuple[Array, Array]:
-        """State (elements + 1, 20) and drive (N, actuators, 4) of one robot at rest, hanging under its weight."""
+    def _settled(self) -> Snapshot:
+        """One robot at rest, hanging under its weight."""
         elements = self.modules * self.plant.elements
         state = _aligned((1, elements + 1, _ELEMENT, self.lanes))
         drive = _aligned((1, self.modules, len(self._places), 4, self.lanes))
@@ -187,11 +216,11 @@ class Fleet:
             drive[:, :, :, _VALVE] = drive[:, :, :, _FORCE] = drive[:, :, :, _GOAL]
         # A robot that hangs straight does not turn, so that the damping of the rotation plays no part, but explicit
         # damping would let rounding grow while it falls.
-        damped = kernel.constants(self.plant, "exponential", self.time_step_s)
+        damped = self._with_arrays("exponential")
         for duration_s in self.plant.settling_slices_s():
             self._advance(damped, state, drive, duration_s)
             state[:, :, _VELOCITY] = state[:, :, _OMEGA] = 0.0
-        return state[0, ..., 0].copy(), drive[0, ..., 0].copy()
+        return Snapshot(state[..., 0].copy(), drive[..., 0].copy())
 
 
 class Arms:
@@ -199,11 +228,19 @@ class Arms:
 
     damping: Damping = "explicit"
 
-    def __init__(self, kind: str, modules: int, count: int) -> None:
+    def __init__(
+        self,
+        kind: str,
+        modules: int,
+        count: int,
+        *,
+        stiffness: Sequence[float] | Array | None = None,
+        tip_payload_kg: float = 0.0,
+    ) -> None:
         from modsoft.training.arm import Arm  # takes seconds to import
 
         self.kind, self.modules, self.count = kind, modules, count
-        self._arms = [Arm(kind, modules) for _ in range(count)]
+        self._arms = [Arm(kind, modules, stiffness=stiffness, tip_payload_kg=tip_payload_kg) for _ in range(count)]
         self.alive = np.ones(count, dtype=bool)
 
     @property
@@ -247,10 +284,18 @@ def _run(robots: Fleet | Arms, actions: Array) -> Array:
     return np.stack(configuration)
 
 
-def simulated(kind: str, modules: int, count: int, damping: Damping = "exponential") -> Fleet | Arms:
+def simulated(
+    kind: str,
+    modules: int,
+    count: int,
+    damping: Damping = "exponential",
+    *,
+    stiffness: Sequence[float] | Array | None = None,
+    tip_payload_kg: float = 0.0,
+) -> Fleet | Arms:
     """`count` robots at rest, on the fastest plant that this installation has. Where it has no kernel, PyElastica
     serves, and standard error is told in one line."""
     if kernel.library() is not None:
-        return Fleet(kind, modules, count, damping)
+        return Fleet(kind, modules, count, damping, stiffness=stiffness, tip_payload_kg=tip_payload_kg)
     print("the fast plant is not built (no C compiler at installation?): PyElastica simulates, slower", file=sys.stderr)
-    return Arms(kind, modules, count)
+    return Arms(kind, modules, count, stiffness=stiffness, tip_payload_kg=tip_payload_kg)

@@ -70,7 +70,7 @@ INLINE void NAME(rotate)(V *restrict q, const V *restrict omega, double h)
 }
 
 /* A: drift of the element and of the node after it by h seconds; length, strain, stress, damping and drag. */
-INLINE void NAME(geometry)(const struct plant *p, ELEMENT *e, WORK *o, double h)
+INLINE void NAME(geometry)(const struct plant *p, double stiffness, ELEMENT *e, WORK *o, double h)
 {
     V d[3], dv[3], v[3], u[3];
     for (int i = 0; i < 3; i++) {
@@ -83,15 +83,15 @@ INLINE void NAME(geometry)(const struct plant *p, ELEMENT *e, WORK *o, double h)
     V length = NAME(root)(DOT(d, d)) + 1e-14; /* as PyElastica has it */
     V inverse = 1.0 / length;
     V radius = NAME(root)(p->volume_over_pi * inverse);
-    V squeeze = p->rest_length * inverse;
+    V firm = stiffness * (p->rest_length * inverse);
     for (int i = 0; i < 3; i++) {
         const V *row = e->director + 3 * i;
         o->strain[i] = DOT(row, d) * p->inverse_rest_length;
         u[i] = DOT(row, v);
     }
-    o->stress[0] = p->shear * o->strain[0] * squeeze;
-    o->stress[1] = p->shear * o->strain[1] * squeeze;
-    o->stress[2] = p->stretch * (o->strain[2] - 1.0) * squeeze;
+    o->stress[0] = p->shear * o->strain[0] * firm;
+    o->stress[1] = p->shear * o->strain[1] * firm;
+    o->stress[2] = p->stretch * (o->strain[2] - 1.0) * firm;
     V section = radius * length;
     for (int i = 0; i < 3; i++) {
         V speed = (V)((M)u[i] & INT64_MAX);
@@ -228,16 +228,17 @@ INLINE void NAME(kick)(const struct plant *p, double mobility, ELEMENT *e, const
 }
 
 /* One time step: drift by h, then kick. The first node and element are clamped: at rest, and never kicked. */
-INLINE void NAME(sweep)(const struct plant *p, int rubs, int elements, int per_module, const double *mobility,
-                        const double *rigidity, const DRIVE *drive, ELEMENT *e, double h)
+INLINE void NAME(sweep)(const struct plant *p, int rubs, int elements, int per_module, const DRIVE *drive, ELEMENT *e,
+                        double h)
 {
+    const double *mobility = p->mobility, *stiffness = p->stiffness, *rigidity = p->rigidity;
     WORK ring[RING];
 #define AT(k) (ring + ((k) & (RING - 1)))
     *AT(0) = *AT(-1) = (WORK){0}; /* nothing bends before the first element */
     for (int k = 0; k < elements + LAG_D; k++) {
         int c = k - LAG_C, d = k - LAG_D;
         if (k < elements)
-            NAME(geometry)(p, e + k, AT(k), h);
+            NAME(geometry)(p, stiffness[k], e + k, AT(k), h);
         if (k > 0 && k < elements)
             NAME(curvature)(p, rigidity[k - 1], e + k - 1, e + k, AT(k - 1), AT(k));
         else if (k == elements)
@@ -265,8 +266,8 @@ INLINE void NAME(follow)(const struct plant *p, int drives, DRIVE *drive)
     }
 }
 
-static void NAME(advance)(const struct plant *p, int block, int modules, int per_module, const double *mobility,
-                          const double *rigidity, double *drives, double *state, long steps)
+static void NAME(advance)(const struct plant *p, int block, int modules, int per_module, double *drives,
+                          double *state, long steps)
 {
     int elements = modules * per_module;
     ELEMENT *e = (ELEMENT *)state + (long)block * (elements + 1);
@@ -276,9 +277,9 @@ static void NAME(advance)(const struct plant *p, int block, int modules, int per
         if (p->lags)
             NAME(follow)(p, modules * p->actuators, drive);
         if (p->friction > 0.0)
-            NAME(sweep)(p, 1, elements, per_module, mobility, rigidity, drive, e, h);
+            NAME(sweep)(p, 1, elements, per_module, drive, e, h);
         else
-            NAME(sweep)(p, 0, elements, per_module, mobility, rigidity, drive, e, h);
+            NAME(sweep)(p, 0, elements, per_module, drive, e, h);
         h = p->time_step;
     }
     h = steps ? 0.5 * p->time_step : 0.0;

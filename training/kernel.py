@@ -45,6 +45,9 @@ class PlantStruct(ctypes.Structure):
         ("gyration", ctypes.c_double * 3),
         ("turn_kick", ctypes.c_double * 3),
         ("fade_kick", ctypes.c_double * 3),
+        ("mobility", ctypes.c_void_p),
+        ("stiffness", ctypes.c_void_p),
+        ("rigidity", ctypes.c_void_p),
     )
 
 
@@ -58,7 +61,7 @@ def library() -> ctypes.CDLL | None:
     if found.fleet_plant_bytes() != ctypes.sizeof(PlantStruct):
         raise ModsoftError(f"{spec.origin} is not of this version of modsoft; install it again (make install)")
     integer, pointer = ctypes.c_int, ctypes.c_void_p
-    found.fleet_advance.argtypes = [integer, pointer, integer, integer, integer, *[pointer] * 4, ctypes.c_long]
+    found.fleet_advance.argtypes = [integer, pointer, integer, integer, integer, *[pointer] * 2, ctypes.c_long]
     found.fleet_advance.restype = None
     found.fleet_peak.argtypes = [ctypes.c_int, ctypes.c_long]
     found.fleet_peak.restype = ctypes.c_double
@@ -72,8 +75,8 @@ def variants() -> list[str]:
 
 
 def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct:
-    """The plant as the kernel wants it. The rod's own numbers are PyElastica's: a disk's second moments, 27/28 for the
-    shear of a section, a third of Young's modulus for shear."""
+    """The plant as the kernel wants it, without the three arrays. The rod's own numbers are PyElastica's: a disk's
+    second moments, 27/28 for the shear of a section, a third of Young's modulus for shear."""
     length = plant.module_length_m / plant.elements
     area = math.pi * plant.radius_m**2
     moment = area**2 / (4 * math.pi)

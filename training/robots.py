@@ -6,6 +6,8 @@ the rod's cross-section; the arm is one straight rod along +z, clamped at the or
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +15,8 @@ from msgspec.structs import fields
 from numpy.typing import NDArray
 
 from modsoft.runtime.robot import Valve
+
+Array = NDArray[np.float64]
 
 PASCAL_PER_BAR = 1e5
 # Chamber pressures at activation 0 and 1: what a robot file means that does not say otherwise.
@@ -68,19 +72,37 @@ class Plant:
     friction_curvature_per_m: float = 0.0
     settling_slices: int = 0  # until the arm hangs still, see settling_slices_s
 
-    def bend_ratios(self, modules: int) -> NDArray[np.float64]:
+    @property
+    def module_kg(self) -> float:
+        """Mass of a module without its connector."""
+        return self.density_kg_m3 * np.pi * self.radius_m**2 * self.module_length_m
+
+    def carrying(self, tip_payload_kg: float) -> Plant:
+        """The same robot with a point mass at its last node, which has weight too."""
+        if not 0.0 <= tip_payload_kg < np.inf:
+            raise ValueError(f"found a payload of {tip_payload_kg} kg at the tip, expected 0 or more")
+        return dataclasses.replace(self, tip_mass_kg=self.tip_mass_kg + tip_payload_kg)
+
+    def stiffness_ratios(self, modules: int, factors: Sequence[float] | Array | None) -> Array:
+        """Stiffness of the elements (modules * elements,) over the kind's own: one factor a module (N,) on all of bend,
+        twist, shear and stretch; None for robots as they should be."""
+        found = np.ones(modules) if factors is None else np.asarray(factors, dtype=np.float64)
+        if found.shape != (modules,) or not ((found > 0.0) & (found < np.inf)).all():
+            raise ValueError(f"found stiffness factors {factors}, expected {modules} positive numbers, base first")
+        return np.repeat(found, self.elements)
+
+    def bend_ratios(self, stiffness: Array) -> Array:
         """Rigidity against bending and twist in the Voronoi domains (elements - 1,), over that of a free section.
 
-        The wall of a module stiffens under the weight W that hangs from its end: 1 + (W / `stiffening_weight_n`) ^
-        `stiffening_power`, but `stiffest_ratio` at most; the mean of both modules at their border. The weight at rest
-        is taken, once and for all: were it the momentary tension, a law without an energy would feed the vibrations
-        along the axis until the arm flew apart.
+        stiffness: `stiffness_ratios` of the elements. The wall of a module stiffens under the weight W that hangs from
+        its end: 1 + (W / `stiffening_weight_n`) ^ `stiffening_power`, but `stiffest_ratio` at most; the mean of both
+        modules at their border. The weight at rest is taken, once and for all: were it the momentary tension, a law
+        without an energy would feed the vibrations along the axis until the arm flew apart.
         """
-        module_kg = self.density_kg_m3 * np.pi * self.radius_m**2 * self.module_length_m
-        below = np.arange(modules)[::-1]
-        hanging_n = self.gravity_m_s2 * (below * (module_kg + self.connector_mass_kg) + self.tip_mass_kg)
+        below = np.arange(len(stiffness) // self.elements)[::-1]
+        hanging_n = self.gravity_m_s2 * (below * (self.module_kg + self.connector_mass_kg) + self.tip_mass_kg)
         ratios = 1.0 + (hanging_n / self.stiffening_weight_n) ** self.stiffening_power
-        of_element = np.repeat(np.minimum(ratios, self.stiffest_ratio), self.elements)
+        of_element = stiffness * np.repeat(np.minimum(ratios, self.stiffest_ratio), self.elements)
         return 0.5 * (of_element[1:] + of_element[:-1])
 
     def settling_slices_s(self) -> list[float]:

@@ -63,6 +63,57 @@ def test_equals_pyelastica_for_other_module_numbers(kind, modules, periods):
     assert largest_difference(kind, modules, periods, seed=2) < 1e-9
 
 
+@needs_kernel
+@pytest.mark.parametrize(
+    ("kind", "modules", "periods", "stiffness", "payload_modules"),
+    [
+        ("cable", 4, 20, [1.1, 0.9, 0.9, 1.1], 1.0),
+        ("cable", 6, 5, None, 1.0),
+        ("cable", 3, 5, [0.9, 1.1, 1.0], 0.0),
+        ("pneumatic", 3, 10, [1.1, 0.9, 1.1], 0.1),
+    ],
+)
+def test_robots_off_the_drawing_equal_pyelastica_too(kind, modules, periods, stiffness, payload_modules):
+    changed = {"stiffness": stiffness, "tip_payload_kg": payload_modules * PLANTS[kind].module_kg}
+    drawn = actions(kind, periods, 1, modules, seed=modules)
+    robots = Fleet(kind, modules, 1, damping="explicit", **changed).run(drawn)[:, 0]
+    arm = Arms(kind, modules, 1, **changed).run(drawn)[:, 0]
+    assert np.abs(robots - arm).max() < 1e-9
+    assert np.abs(robots - Fleet(kind, modules, 1, damping="explicit").run(drawn)[:, 0]).max() > 0.02
+
+
+@needs_kernel
+def test_a_softer_module_bends_further_and_the_others_much_as_before():
+    """Held until the robot stands still, nearly: the couple of the cables is the same."""
+    drawn = np.broadcast_to([[0.3, 0.0]] * 3, (20, 1, 3, 2))
+    stiff, soft = Fleet("cable", 3, 1).run(drawn), Fleet("cable", 3, 1, stiffness=[1.0, 0.8, 1.0]).run(drawn)
+    angle = np.degrees(np.arccos([stiff[-1, 0, :, 2], soft[-1, 0, :, 2]]))
+    assert 1.1 < angle[1, 1] / angle[0, 1] < 1.4
+    assert np.abs(angle[1, [0, 2]] / angle[0, [0, 2]] - 1.0).max() < 0.1
+
+
+@needs_kernel
+@pytest.mark.parametrize("modules", [4, 6, 12])
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_robots_off_the_drawing_stay_whole_under_full_range_jumps(modules, factor):
+    drawn = np.random.default_rng(modules).choice([-1.0, 1.0], (3, 16, modules, 2))
+    robots = Fleet("cable", modules, 16, stiffness=[factor] * modules, tip_payload_kg=PLANTS["cable"].module_kg)
+    robots.run(drawn)
+    assert robots.alive.all()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"stiffness": [1.0, 1.0]}, {"stiffness": [1.0, 0.0, 1.0]}, {"stiffness": [1.0, np.nan, 1.0]},
+     {"tip_payload_kg": -0.01}, {"tip_payload_kg": np.nan}],
+)  # fmt: skip
+def test_stiffness_and_payload_of_no_robot_are_refused(changed):
+    makers = [Arm] if kernel.library() is None else [Arm, lambda *given, **more: Fleet(*given, 1, **more)]
+    for make in makers:
+        with pytest.raises(ValueError, match=r"expected 3 positive numbers|expected 0 or more"):
+            make("cable", 3, **changed)
+
+
 @pytest.fixture(scope="module")
 def recorded():
     """Actions (250, 3, 4, 2) and configurations (250, 3, 4, 3) of the three recorded runs, side by side."""
@@ -132,6 +183,22 @@ def test_reset_begins_the_same_run_again():
     first = robots.run(drawn)
     robots.reset()
     assert np.array_equal(robots.run(drawn), first)
+
+
+@needs_kernel
+@pytest.mark.parametrize("kind", ["cable", "pneumatic"])
+def test_a_snapshot_goes_on_where_it_was_taken(kind):
+    drawn = actions(kind, 4, 11, 2, seed=8)
+    robots = Fleet(kind, 2, 11)
+    robots.run(drawn[:2])
+    taken = robots.snapshot()
+    went = robots.run(drawn[2:])
+    robots.restore(taken)
+    assert np.array_equal(robots.run(drawn[2:]), went)
+    # One robot's snapshot, in all the others: they repeat what it did.
+    robots.restore(taken)
+    robots.restore(robots.snapshot([9]))
+    assert np.array_equal(robots.run(np.repeat(drawn[2:, 9:10], 11, axis=1)), np.repeat(went[:, 9:10], 11, axis=1))
 
 
 @needs_kernel
