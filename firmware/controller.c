@@ -11,15 +11,17 @@ static uint8_t in_session(const struct controller *c) { return c->state == STATE
 
 static void send(struct controller *c, uint8_t type, const void *payload, uint8_t length) {
   uint8_t encoded[FRAME_MAX_ENCODED];
-  uint8_t size = frame_encode(encoded, type, c->tx_seq, c->session, payload, length);
-  uint8_t queued = (uint8_t)(c->tx_head - c->tx_tail);
-  if (queued + size >= (int)sizeof c->tx) {
-    return;
+  uint8_t head = c->tx_head;
+  uint8_t room = (uint8_t)(c->tx_tail - head - 1); /* a full ring would look like an empty one */
+  if (FRAME_ENCODED_LENGTH(length) > room) {
+    return; /* before the work of encoding: the line carries 25 bytes a millisecond, whatever is asked of us */
   }
-  c->tx_seq++;
-  for (uint8_t i = 0; i < size; i++) {
-    c->tx[c->tx_head++] = encoded[i];
-  }
+  uint16_t to_end = (uint16_t)(sizeof c->tx - head);
+  uint8_t size = frame_encode(encoded, type, c->tx_seq++, c->session, payload, length);
+  uint8_t first = size < to_end ? size : (uint8_t)to_end;
+  memcpy(c->tx + head, encoded, first);
+  memcpy(c->tx, encoded + first, (uint8_t)(size - first));
+  c->tx_head = (uint8_t)(head + size);
 }
 
 static void send_hello(struct controller *c) {
@@ -224,7 +226,8 @@ static void on_clear_fault(struct controller *c, const struct frame *frame) {
   send_status(c);
 }
 
-static void on_frame(struct controller *c, const struct frame *frame, uint32_t now_ms) {
+/* Not inlined: a byte that ends no frame need not pay for the room that the answers take on the stack. */
+__attribute__((noinline)) static void on_frame(struct controller *c, const struct frame *frame, uint32_t now_ms) {
   int16_t expected = protocol_payload_length(frame->type);
   if (expected < 0) {
     refuse(c, frame, NACK_REASON_TYPE);
@@ -326,18 +329,18 @@ void controller_init(struct controller *c, uint32_t boot_id, uint8_t reset_cause
   send_hello(c);
 }
 
-void controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms) {
+uint8_t controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms) {
   struct frame frame;
   switch (frame_receive(&c->parser, byte, &frame)) {
     case FRAME_GOOD:
       c->rx_good++;
       on_frame(c, &frame, now_ms);
-      break;
+      return 1;
     case FRAME_BAD:
       c->rx_bad++;
-      break;
-    case FRAME_NONE:
-      break;
+      return 0;
+    default:
+      return 0;
   }
 }
 

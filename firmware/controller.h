@@ -59,8 +59,8 @@ struct controller {
 /* Starts vented, in BOOT, with the HELLO already queued. */
 void controller_init(struct controller *c, uint32_t boot_id, uint8_t reset_cause, uint32_t now_ms);
 
-/* One byte from the host. */
-void controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms);
+/* One byte from the host. Returns 1 when it ended a good frame, which has been carried out or refused then. */
+uint8_t controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms);
 
 /* Once a loop: timers, faults, outputs, STATUS. measured is in 10 Pa, PROTOCOL_NOT_MEASURED where there is no sensor.
  * Returns the checks done, CHECK_ALL when all is well; then, and only then, the watchdog may be fed. */

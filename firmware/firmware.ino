@@ -12,6 +12,8 @@
 #include "pwm.h"
 #include "sensors.h"
 
+#define BYTES_PER_PASS 8  // each way; a pass comes with every byte, or sooner
+
 static struct controller board;
 static struct sensors inputs;
 
@@ -29,9 +31,11 @@ void loop() {
   static uint32_t last_ms;
   const uint32_t now_ms = millis();
 
-  // At most one receive buffer a pass, so that a flood cannot keep the checks from running.
-  for (uint8_t i = 0; i < SERIAL_RX_BUFFER_SIZE && Serial.available() > 0; i++) {
-    controller_receive(&board, (uint8_t)Serial.read(), now_ms);
+  // One frame and a few bytes a pass, so that a flood cannot keep the checks from running.
+  for (uint8_t i = 0; i < BYTES_PER_PASS && Serial.available() > 0; i++) {
+    if (controller_receive(&board, (uint8_t)Serial.read(), now_ms)) {
+      break;  // what is left waits for the next interrupt, as the sleep below does
+    }
   }
   if (now_ms != last_ms) {  // every byte wakes us; a millisecond is soon enough for all the rest
     last_ms = now_ms;
@@ -44,8 +48,8 @@ void loop() {
       boot_feed_watchdog(now_ms);
     }
   }
-  // Never waits for the host to read.
-  while (Serial.availableForWrite() > 0) {
+  // Never waits for the host to read, and never long for the copying: every byte that leaves wakes us for more.
+  for (uint8_t i = 0; i < BYTES_PER_PASS && Serial.availableForWrite() > 0; i++) {
     const int16_t next = controller_next_byte(&board);
     if (next < 0) {
       break;

@@ -2,17 +2,26 @@
 
 #include <string.h>
 
+#ifdef __AVR__
+#define IN_FLASH __flash /* the chip has 256 KiB of it, and 8 KiB of memory */
+#else
+#define IN_FLASH
+#endif
+
+/* What a byte does to the CRC is the sum (exclusive or) of what its bits do, so these eight make the whole table. */
+#define BIT(byte, bit, effect) ((byte) >> (bit)&1 ? effect : 0)
+#define ENTRY(byte)                                                                                          \
+  (BIT(byte, 0, 0x77073096UL) ^ BIT(byte, 1, 0xee0e612cUL) ^ BIT(byte, 2, 0x076dc419UL) ^ BIT(byte, 3, 0x0edb8832UL) ^ \
+   BIT(byte, 4, 0x1db71064UL) ^ BIT(byte, 5, 0x3b6e20c8UL) ^ BIT(byte, 6, 0x76dc4190UL) ^ BIT(byte, 7, 0xedb88320UL))
+#define FOUR(n) ENTRY(n), ENTRY((n) + 1), ENTRY((n) + 2), ENTRY((n) + 3)
+#define SIXTEEN(n) FOUR(n), FOUR((n) + 4), FOUR((n) + 8), FOUR((n) + 12)
+#define SIXTY_FOUR(n) SIXTEEN(n), SIXTEEN((n) + 16), SIXTEEN((n) + 32), SIXTEEN((n) + 48)
+
 uint32_t frame_crc32(const uint8_t *data, uint8_t length) {
-  /* Four bits at a time: sixteen entries are a fair price on a chip with 8 KiB of memory. */
-  static const uint32_t table[16] = {
-      0x00000000UL, 0x1db71064UL, 0x3b6e20c8UL, 0x26d930acUL, 0x76dc4190UL, 0x6b6b51f4UL, 0x4db26158UL, 0x5005713cUL,
-      0xedb88320UL, 0xf00f9344UL, 0xd6d6a3e8UL, 0xcb61b38cUL, 0x9b64c2b0UL, 0x86d3d2d4UL, 0xa00ae278UL, 0xbdbdf21cUL,
-  };
+  static const IN_FLASH uint32_t table[256] = {SIXTY_FOUR(0), SIXTY_FOUR(64), SIXTY_FOUR(128), SIXTY_FOUR(192)};
   uint32_t crc = 0xffffffffUL;
   while (length--) {
-    crc ^= *data++;
-    crc = (crc >> 4) ^ table[crc & 15];
-    crc = (crc >> 4) ^ table[crc & 15];
+    crc = (crc >> 8) ^ table[(uint8_t)crc ^ *data++];
   }
   return ~crc;
 }
@@ -25,7 +34,8 @@ static void append(struct frame_parser *parser, uint8_t byte) {
   }
 }
 
-static enum frame_event finish(struct frame_parser *parser, struct frame *frame) {
+/* Not inlined: most bytes end no frame, and need not save the registers that this takes. */
+__attribute__((noinline)) static enum frame_event finish(struct frame_parser *parser, struct frame *frame) {
   enum frame_event event = FRAME_NONE;
   if (parser->started) {
     event = FRAME_BAD;
@@ -74,40 +84,29 @@ enum frame_event frame_receive(struct frame_parser *parser, uint8_t byte, struct
   return FRAME_NONE;
 }
 
-/* One COBS code byte in the making. */
-struct stuffing {
-  uint8_t *code;
-  uint8_t *next;
-};
-
-static void stuff(struct stuffing *out, const uint8_t *data, uint8_t length) {
-  while (length--) {
-    uint8_t byte = *data++;
-    if (byte == 0) {
-      *out->code = (uint8_t)(out->next - out->code);
-      out->code = out->next++;
-    } else {
-      *out->next++ = byte;
-    }
-  }
-}
-
 uint8_t frame_encode(uint8_t *encoded, uint8_t type, uint8_t seq, uint8_t session, const void *payload,
                      uint8_t length) {
-  uint8_t body[PROTOCOL_MAX_DECODED];
-  struct stuffing out = {encoded + 1, encoded + 2};
+  /* Stuffed where it lies: a COBS code byte takes the place of the zero before its run. */
+  uint8_t *body = encoded + 2;
   uint8_t size = (uint8_t)(PROTOCOL_HEADER_LENGTH + length);
+  uint8_t *code = encoded + 1;
+  uint8_t *end = body + size + PROTOCOL_CRC_LENGTH;
   uint32_t crc;
 
+  encoded[0] = PROTOCOL_DELIMITER;
   body[0] = type;
   body[1] = seq;
   body[2] = session;
   memcpy(body + PROTOCOL_HEADER_LENGTH, payload, length);
   crc = frame_crc32(body, size);
   memcpy(body + size, &crc, sizeof crc);
-  encoded[0] = PROTOCOL_DELIMITER;
-  stuff(&out, body, (uint8_t)(size + PROTOCOL_CRC_LENGTH));
-  *out.code = (uint8_t)(out.next - out.code);
-  *out.next++ = PROTOCOL_DELIMITER;
-  return (uint8_t)(out.next - encoded);
+  for (uint8_t *byte = body; byte != end; byte++) {
+    if (*byte == 0) {
+      *code = (uint8_t)(byte - code);
+      code = byte;
+    }
+  }
+  *code = (uint8_t)(end - code);
+  *end++ = PROTOCOL_DELIMITER;
+  return (uint8_t)(end - encoded);
 }

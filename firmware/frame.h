@@ -22,18 +22,20 @@ enum frame_event { FRAME_NONE, FRAME_GOOD, FRAME_BAD };
 
 /* Decodes byte by byte; zeroed memory is a valid start. */
 struct frame_parser {
-  uint8_t decoded[PROTOCOL_MAX_DECODED];
-  uint8_t length;
+  uint8_t length; /* of what is decoded so far */
   uint8_t remaining;    /* bytes of the current COBS run still to come */
   uint8_t zero_pending; /* the last run ends in a zero, unless the frame ends first */
   uint8_t started;      /* something came since the last delimiter */
   uint8_t broken;       /* too long: dropped up to the next delimiter */
+  uint8_t decoded[PROTOCOL_MAX_DECODED];
 };
 
 /* Takes one byte. FRAME_GOOD: *frame is set. FRAME_BAD: something ended that was no frame. */
 enum frame_event frame_receive(struct frame_parser *parser, uint8_t byte, struct frame *frame);
 
-/* Largest result of frame_encode: both delimiters and the COBS code byte. */
+/* Result of frame_encode for a payload of this length: both delimiters, the COBS code byte (bodies are shorter than the
+ * 254 bytes that would need a second one), header and CRC. */
+#define FRAME_ENCODED_LENGTH(length) ((length) + PROTOCOL_HEADER_LENGTH + PROTOCOL_CRC_LENGTH + 3)
 #define FRAME_MAX_ENCODED (PROTOCOL_MAX_ENCODED + 2)
 
 /* Writes a whole frame with its delimiters, returns its length. The payload must fit PROTOCOL_MAX_DECODED. */
