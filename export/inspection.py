@@ -15,7 +15,7 @@ from modsoft.runtime.controller import Controller
 def print_model(path: Path) -> None:
     """Proves the file as the runtime does (`ModelError` otherwise), then prints its graph and its description."""
     said = Controller.load(path).description
-    model = onnx.load(path)
+    model = onnx.load(path, load_external_data=False)
     operators = Counter(node.op_type for node in model.graph.node)
     print(f"{path}: {path.stat().st_size} bytes; seal, description and golden pairs hold")
     print(f"graph: IR version {model.ir_version}, opset {model.opset_import[0].version}, {operators.total()} nodes")

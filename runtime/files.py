@@ -1,4 +1,4 @@
-"""Files that a command writes: under their own name only when whole, and never over anything that is no file."""
+"""What a command reads is a file; what it writes has its name only when whole, and never replaces what is no file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,15 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
-from modsoft.runtime.errors import OutputError, UsageError
+from modsoft.runtime.errors import ModelError, OutputError, UsageError
+
+
+def check_is_file(path: Path, what: str, advice: str) -> None:
+    """`ModelError` where no regular file is at `path`. what: which file is meant; advice: where one comes from."""
+    if path.is_dir():
+        raise ModelError(f"{path}: found a folder, expected a {what}; {advice}")
+    if not path.is_file():
+        raise ModelError(f"no {what} {path}; {advice}")
 
 
 def check_writable(path: Path) -> None:

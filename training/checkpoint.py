@@ -9,7 +9,8 @@
     provenance  {"data_sha256", "seed", "code_version", "date", "split", "samples", "iterations", "errors_percent", ...}
     resume      what training needs to go on (optimiser, random states); absent in a finished model
 
-It is read with `weights_only=True`, so that a file from a stranger runs no code, and only when every checksum holds.
+It is read with `weights_only=True`, so that a file from a stranger runs no code, and only when every checksum holds,
+the archive is one that torch.save writes, and the tensors are no larger than the file.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import pickle
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ import torch
 from torch import nn
 
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import written
+from modsoft.runtime.files import check_is_file, written
 from modsoft.training import networks
 
 SCHEMA = 1
@@ -44,13 +46,9 @@ def save(checkpoint: dict[str, Any], path: Path) -> None:
 
 def read(path: Path) -> dict[str, Any]:
     """Whatever dict torch stored at `path`, unchecked: a checkpoint, or a bare state dict."""
-    if not path.is_file():
-        raise ModelError(f"no model file {path}; modsoft-train --out {path} makes one")
+    check_is_file(path, "model file", f"modsoft-train --out {path} makes one")
     try:
-        with zipfile.ZipFile(path) as archive:  # torch reads old formats too, and does not look at the checksums
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise ModelError(f"{path}: damaged: {damaged} in it fails its checksum; copy or train it again")
+        _check_archive(path)  # torch reads old formats too, and does not look at the checksums
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:  # torch's own message recommends loading it with code and all
         raise ModelError(
@@ -61,7 +59,41 @@ def read(path: Path) -> dict[str, Any]:
         raise ModelError(f"{path}: not a checkpoint of modsoft-train, or damaged ({first})") from error
     if not isinstance(checkpoint, dict):
         raise ModelError(f"{path}: holds a {type(checkpoint).__name__}, expected a checkpoint of modsoft-train")
+    if not all(_fills_its_storage(tensor) for tensor in _tensors(checkpoint)):
+        raise ModelError(f"{path}: not a checkpoint of modsoft-train (a tensor larger than what the file holds of it)")
     return checkpoint
+
+
+def _check_archive(path: Path) -> None:
+    """`ModelError` for a zip archive that is damaged or other than torch.save writes them: one folder, nothing
+    compressed, nothing twice, no TorchScript."""
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+        if damaged := archive.testzip():
+            raise ModelError(f"{path}: damaged: {damaged} in it fails its checksum; copy or train it again")
+    names = [entry.filename for entry in entries]
+    folder = names[0].partition("/")[0] if names else ""
+    for entry, name in zip(entries, names, strict=True):
+        inside = name.removeprefix(f"{folder}/")
+        is_within = folder not in ("", "..") and inside != name and not {"..", ""} & set(inside.split("/"))
+        is_plain = entry.compress_type == zipfile.ZIP_STORED and name == entry.orig_filename and "\\" not in name
+        if not (is_within and is_plain) or names.count(name) > 1 or inside == "constants.pkl":
+            raise ModelError(f"{path}: not a checkpoint of modsoft-train (an archive with the entry {name!r})")
+
+
+def _tensors(value: Any) -> Iterator[torch.Tensor]:
+    """All tensors in nested dicts and lists."""
+    if isinstance(value, torch.Tensor):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _tensors(inner)
+
+
+def _fills_its_storage(tensor: torch.Tensor) -> bool:
+    """False for a tensor whose strides make it look larger than the numbers that were read for it."""
+    is_plain = tensor.layout == torch.strided and not tensor.is_quantized
+    return is_plain and tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -77,9 +109,12 @@ def load(path: Path) -> dict[str, Any]:
 
 def network_of(checkpoint: dict[str, Any]) -> nn.Module:
     """The network with its weights, in evaluation mode."""
-    network = networks.build(checkpoint["network"])
+    description, weights = checkpoint["network"], checkpoint["weights"]
     try:
-        network.load_state_dict(checkpoint["weights"])
-    except RuntimeError as error:
+        with torch.device("meta"):  # takes no memory, whatever sizes the file claims
+            networks.build(description).load_state_dict(weights, assign=True)
+        network = networks.build(description)
+        network.load_state_dict(weights)
+    except (RuntimeError, TypeError, ValueError, KeyError) as error:
         raise ModelError(f"the checkpoint's weights do not fit its own description: {error}") from error
     return network.eval()

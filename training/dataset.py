@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import episode_features, state_of
-from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import written
+from modsoft.runtime.errors import ModelError, RobotFileError
+from modsoft.runtime.files import check_is_file, written
 from modsoft.runtime.robot import Robot
+from modsoft.training.hdf5 import own_array
 
 SCHEMA = 1
 # Shares of training, validation and test, as in the paper (70/10/20); these are where the second and third begin.
@@ -123,8 +124,7 @@ def join(
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[h5py.File, Header]]:
-    if not path.is_file():
-        raise ModelError(f"no data set {path}; modsoft-collect --out {path} makes one")
+    check_is_file(path, "data set", f"modsoft-collect --out {path} makes one")
     try:
         with h5py.File(path, "r") as file:
             schema = int(file.attrs["schema"])
@@ -136,7 +136,7 @@ def _opened(path: Path) -> Iterator[tuple[h5py.File, Header]]:
                     recipe=json.loads(file.attrs["recipe"]),
                     stage_borders=np.asarray(file.attrs["stage_borders"], dtype=np.int64),
                     redrawn=int(file.attrs["redrawn"]),
-                    episodes=len(file["action"]),
+                    episodes=len(own_array(file, "action")),
                 ),
             )
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
@@ -154,8 +154,8 @@ def read(path: Path) -> DataSet:
     with _opened(path) as (file, header):
         data = DataSet(
             recipe=header.recipe,
-            configuration=file["configuration"][()],
-            action=file["action"][()],
+            configuration=own_array(file, "configuration")[()],
+            action=own_array(file, "action")[()],
             stage_borders=header.stage_borders,
             redrawn=header.redrawn,
         )
@@ -164,7 +164,10 @@ def read(path: Path) -> DataSet:
 
 
 def _check(data: DataSet, path: Path) -> None:
-    robot = data.robot
+    try:
+        robot = data.robot
+    except (KeyError, TypeError, RobotFileError) as error:  # of this file, not of a robot file that the user can mend
+        raise ModelError(f"{path}: its robot cannot be read ({error}); collect it again") from error
     episodes, steps = data.action.shape[:2] if data.action.ndim == 4 else (0, 0)
     expected = {
         "action": (episodes, steps, robot.modules, robot.action_size),
