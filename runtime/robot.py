@@ -6,6 +6,7 @@ file, what was found and what was expected (`RobotFileError`, exit code 64). Uni
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections import Counter
 from importlib import resources
@@ -152,10 +153,14 @@ def names() -> list[str]:
 
 
 def text_of(name: str) -> str:
-    """The robot file of a shipped robot, comments and all, to start one's own from."""
-    if name not in names():
-        raise RobotFileError(f"no robot is called {name!r}; the ones that ship are {', '.join(names())}")
-    return (resources.files("modsoft.runtime") / "robots" / f"{name}.toml").read_text(encoding="utf-8")
+    """The robot file of a shipped robot, comments and all, to start one's own from. Cable robots are simulated, so that
+    there is one for any number N of modules: cable-N."""
+    if name in names():
+        return (resources.files("modsoft.runtime") / "robots" / f"{name}.toml").read_text(encoding="utf-8")
+    if cable := re.fullmatch(r"cable-([1-9][0-9]?)", name):
+        text = text_of("cable-4").replace('"cable-4"', f'"{name}"').replace("modules = 4", f"modules = {cable[1]}")
+        return text.replace("4 modules", f"{cable[1]} modules")
+    raise RobotFileError(f"no robot is called {name!r}; the ones that ship are {', '.join(names())}, and cable-N")
 
 
 def load(file_or_name: str | Path) -> Robot:
@@ -169,12 +174,15 @@ def load(file_or_name: str | Path) -> Robot:
         except (OSError, UnicodeDecodeError) as error:
             raise RobotFileError(f"{path}: cannot be read as UTF-8 text ({error})") from error
         return parse(text, str(path))
-    if str(file_or_name) in names():
-        return parse(text_of(str(file_or_name)), str(file_or_name))
-    raise RobotFileError(
-        f"no robot file {str(file_or_name)!r} here, and no shipped robot of that name; give a file or one of "
-        f"{', '.join(names())} (modsoft-runtime --print-robot pneumatic-3 > robot.toml makes one to start from)"
-    )
+    try:
+        text = text_of(str(file_or_name))
+    except RobotFileError:
+        raise RobotFileError(
+            f"no robot file {str(file_or_name)!r} here, and no shipped robot of that name; give a file or one of "
+            f"{', '.join(names())}, cable-N (modsoft-runtime --print-robot pneumatic-3 > robot.toml makes one to start "
+            "from)"
+        ) from None
+    return parse(text, str(file_or_name))
 
 
 def parse(text: str, where: str = "robot file") -> Robot:

@@ -11,21 +11,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from modsoft.runtime import task_tables
 from modsoft.runtime.configuration import from_angles_deg
 from modsoft.runtime.errors import UsageError
 from modsoft.runtime.robot import Robot
+from modsoft.runtime.task_tables import Bend
 
 Array = NDArray[np.float64]
 
 SIMULATED_STEPS = 250
 REAL_STEPS = 200
 
-# Per task and number of modules: smallest v_z of each module, base first (A); v_z and amplitude (B); both (C).
-SPIRAL_V_Z = {4: [0.975, 0.850, 0.725, 0.625], 6: [0.998, 0.995, 0.950, 0.850, 0.800, 0.650]}
-CIRCLE_V_Z = {4: [0.998, 0.998, 0.996, 0.600], 6: [0.999, 0.999, 0.999, 0.998, 0.995, 0.708]}
-CIRCLE_SIGN = {4: [1, 1, 1, -1], 6: [1, 1, 1, 1, -1, -1]}
-BEND_V_Z = {4: [0.941, 0.998, 0.897, 0.650], 6: [0.999, 0.996, 0.985, 0.975, 0.925, 0.600]}
-BEND_SIGN = {4: [1, 1, 1, -1], 6: [1, 1, 1, 1, 1, -1]}
 # Largest angles of the planar tasks, degrees.
 EDGE_DEG = {3: [5.4, 18.0, 90.0], 2: [21.6, 72.0]}
 DOWN_DEG = {3: [3.6, 36.0, -39.6], 2: [32.4, -32.4]}
@@ -37,24 +33,23 @@ def _turn(phase: Array, v_z: Array, sign: Array) -> Array:
     return np.stack([np.sin(phase)[:, None] * side, np.cos(phase)[:, None] * side, v_z], axis=-1)
 
 
-def task_a(v_z_min: list[float]) -> Array:
+def task_a(least: Bend) -> Array:
     """S1: all modules turn once while they bend ever further."""
     t = np.arange(SIMULATED_STEPS) / SIMULATED_STEPS
-    v_z = 1.0 - (1.0 - np.asarray(v_z_min)) * t[:, None]
-    return _turn(2 * np.pi * t, v_z, np.ones(len(v_z_min)))
+    return _turn(2 * np.pi * t, 1.0 - (1.0 - least.v_z) * t[:, None], least.sign)
 
 
-def task_b(v_z: list[float], sign: list[int]) -> Array:
+def task_b(held: Bend) -> Array:
     """S2: one turn at constant bend; the first step is a jump from rest."""
     t = np.arange(SIMULATED_STEPS) / SIMULATED_STEPS
-    return _turn(2 * np.pi * t, np.broadcast_to(v_z, (SIMULATED_STEPS, len(v_z))), np.asarray(sign))
+    return _turn(2 * np.pi * t, np.broadcast_to(held.v_z, (SIMULATED_STEPS, len(held.v_z))), held.sign)
 
 
-def task_c(v_z_min: list[float], sign: list[int]) -> Array:
+def task_c(least: Bend) -> Array:
     """S3, S4: 50 steps of bending in y, then one turn."""
     t = np.arange(SIMULATED_STEPS)
-    v_z = 1.0 - (1.0 - np.asarray(v_z_min)) * np.minimum(t / 50, 1.0)[:, None]
-    return _turn(2 * np.pi * np.maximum(t - 50, 0) / 200, v_z, np.asarray(sign))
+    v_z = 1.0 - (1.0 - least.v_z) * np.minimum(t / 50, 1.0)[:, None]
+    return _turn(2 * np.pi * np.maximum(t - 50, 0) / 200, v_z, least.sign)
 
 
 def task_planar(largest_deg: list[float]) -> Array:
@@ -71,9 +66,9 @@ def ahead(desired: Array) -> Array:
 
 
 def available(kind: str, modules: int) -> list[str]:
-    """Names of the tasks that the supplement defines for such a robot."""
+    """Names of the tasks for such a robot. Those of a cable robot that the paper does not have are like the paper's."""
     if kind == "cable":
-        return ["A", "B", "C"] if modules in SPIRAL_V_Z else []
+        return ["A", "B", "C"]
     return ["edge", "down"] if modules in EDGE_DEG else []
 
 
@@ -87,11 +82,11 @@ def task(name: str, kind: str, modules: int) -> Array:
         )
     match name:
         case "A":
-            return task_a(SPIRAL_V_Z[modules])
+            return task_a(task_tables.spiral(modules))
         case "B":
-            return task_b(CIRCLE_V_Z[modules], CIRCLE_SIGN[modules])
+            return task_b(task_tables.circle(modules))
         case "C":
-            return task_c(BEND_V_Z[modules], BEND_SIGN[modules])
+            return task_c(task_tables.bend(modules))
         case "edge":
             return task_planar(EDGE_DEG[modules])
         case _:

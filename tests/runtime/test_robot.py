@@ -24,6 +24,21 @@ def test_exactly_these_four_ship():
     assert robots.names() == ["cable-4", "cable-6", "pneumatic-2", "pneumatic-3"]
 
 
+@pytest.mark.parametrize("modules", [2, 3, 5, 8, 12, 64])
+def test_a_cable_robot_of_any_number_of_modules_has_a_name(modules):
+    name = f"cable-{modules}"
+    expected = robots.load("cable-4").to_dict()
+    expected["robot"] |= {"name": name, "modules": modules}
+    assert robots.load(name).to_dict() == expected
+    assert f"robot of {modules} modules" in robots.text_of(name)
+
+
+@pytest.mark.parametrize("name", ["cable-1", "cable-65", "cable-0", "cable-", "cable-05", "pneumatic-4"])
+def test_no_robot_has_such_a_number_of_modules(name):
+    with pytest.raises(RobotFileError, match=name):
+        robots.load(name)
+
+
 def test_printed_robot_can_be_read_from_a_file(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text(robots.text_of("pneumatic-3"))

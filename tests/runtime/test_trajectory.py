@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
-from modsoft.runtime import configuration, robot, trajectory
+from modsoft.runtime import configuration, robot, task_tables, trajectory
 from modsoft.runtime.errors import UsageError
 
 
-@pytest.mark.parametrize(("kind", "modules"), [("cable", 4), ("cable", 6), ("pneumatic", 2), ("pneumatic", 3)])
+@pytest.mark.parametrize(
+    ("kind", "modules"),
+    [*(("cable", modules) for modules in (2, 3, 4, 5, 6, 8, 12, 64)), ("pneumatic", 2), ("pneumatic", 3)],
+)
 def test_every_task_is_a_row_of_unit_vectors(kind, modules):
     for name in trajectory.available(kind, modules):
         desired = trajectory.task(name, kind, modules)
@@ -30,8 +33,49 @@ def test_task_b_holds_v_z_and_the_tip_turns_against_the_others():
 def test_task_c_bends_in_y_then_turns():
     desired = trajectory.task("C", "cable", 6)
     np.testing.assert_allclose(desired[:51, :, 0], 0, atol=1e-12)
-    np.testing.assert_allclose(desired[50, :, 2], trajectory.BEND_V_Z[6])
+    np.testing.assert_allclose(desired[50, :, 2], [0.999, 0.996, 0.985, 0.975, 0.925, 0.600])
     np.testing.assert_allclose(desired[100, 5, 0], -0.8, atol=1e-12)  # a quarter turn, a = -1
+
+
+def angles_deg(bend):
+    return np.degrees(bend.sign * np.arccos(bend.v_z))
+
+
+def test_the_papers_robots_have_the_papers_tables():
+    for modules in (4, 6):
+        assert task_tables.spiral(modules).v_z.tolist() == task_tables.SPIRAL_V_Z[modules]
+        for made, v_z, sign in [
+            (task_tables.circle(modules), task_tables.CIRCLE_V_Z, task_tables.CIRCLE_SIGN),
+            (task_tables.bend(modules), task_tables.BEND_V_Z, task_tables.BEND_SIGN),
+        ]:
+            assert (made.v_z.tolist(), made.sign.tolist()) == (v_z[modules], sign[modules])
+
+
+@pytest.mark.parametrize("modules", [2, 3, 5, 7, 8, 12])
+def test_tasks_of_other_robots_are_of_the_papers_shape(modules):
+    spiral, circle, bend = (angles_deg(make(modules)) for make in
+                            (task_tables.spiral, task_tables.circle, task_tables.bend))  # fmt: skip
+    assert all(np.abs(each).max() < 53.2 for each in (spiral, circle, bend))  # what the paper asks of a module
+    assert (np.diff(spiral) >= 0).all()
+    if modules > 4:
+        assert 139 < spiral.sum() < 170
+    assert bend.sum() == pytest.approx(0.0, abs=1e-9)
+    assert (bend < 0).tolist() == [False] * (modules - 1) + [True]
+    backward = 1 if modules < 6 else 2
+    assert (circle < 0).tolist() == [False] * (modules - backward) + [True] * backward
+    assert 11 < circle[circle > 0].sum() < 13
+    assert -54 < circle[circle < 0].sum() < -50
+
+
+@pytest.mark.parametrize("modules", [2, 3, 5, 8, 12])
+def test_the_tip_stays_near_the_axis_in_task_b_and_upright_in_task_c(modules):
+    """Modules as arcs of equal length in one plane: as far from the axis as the paper's robots, over the length, or
+    little farther."""
+    ends_rad = np.radians(np.cumsum(angles_deg(task_tables.circle(modules))))
+    starts_rad = np.concatenate([[0.0], ends_rad[:-1]])
+    aside = (np.cos(starts_rad) - np.cos(ends_rad)) / (ends_rad - starts_rad)
+    assert abs(aside.sum() / modules) < 0.08
+    assert abs(angles_deg(task_tables.bend(modules)).sum()) < 1e-9
 
 
 @pytest.mark.parametrize(("modules", "largest"), [(3, [3.6, 36.0, -39.6]), (2, [32.4, -32.4])])
