@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime.actuation import channel_pressures_bar, limited
-from modsoft.runtime.clock import Tick, Ticker
+from modsoft.runtime.clock import SLICE_S, Tick, Ticker
 from modsoft.runtime.configuration import Window, state_of
 from modsoft.runtime.correction import Correction, NoCorrection
 from modsoft.runtime.errors import LostInRun
@@ -142,7 +142,8 @@ class Loop:
         # A frame just after a tick is young enough for the next one, so counting bad ticks alone could take a period
         # longer than the robot file allows.
         frame, silence_s = self.slot.latest(), self.robot.limits.invalid_frames * self.robot.loop.period_s
-        if frame is not None and self.ticker.now() - frame.monotonic_s > silence_s:
+        # This is asked once a slice, so that the end is half a slice early at most, or half a slice late.
+        if frame is not None and self.ticker.now() - frame.monotonic_s > silence_s - SLICE_S / 2:
             raise LostInRun(f"tracker: no new frame for {silence_s:.1f} s; look at the tracker, then start again")
 
     def _acknowledged(self, step: int, sequence: int | None) -> dict[str, Any]:

@@ -1,31 +1,42 @@
-"""Small trained-looking models for every part that needs one. The numbers are random; the formats are real."""
+"""Small trained-looking models for every part that needs one. The numbers are random; the formats are real.
+
+What tests of several parts share stands in tests/shared, importable by its file's name.
+"""
+
+import sys
+from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "shared"))
 
 
 @pytest.fixture(scope="session")
 def make_checkpoint():
     """make_checkpoint(path, robot="pneumatic-3", ...) writes a random checkpoint; gain scales its weights up."""
 
-    def make(path, robot="pneumatic-3", history=3, layers=2, hidden=8, gain=1.0, seed=0):
+    def make(path, robot="pneumatic-3", history=3, layers=2, hidden=8, gain=1.0, seed=0, name="bilstm"):
         import torch
 
         from modsoft.runtime import robot as robots
         from modsoft.runtime.configuration import feature_names
         from modsoft.training import checkpoint as checkpoints
-        from modsoft.training.networks import BiLSTM
+        from modsoft.training import networks
 
         found = robots.load(robot)
         names = feature_names(found.robot.kind, history)
+        sizes = {"name": name, "feature_size": len(names), "action_size": found.action_size, "layers": layers}
+        sizes |= {"hidden": hidden, "dropout": 0.1, "history": history}
+        if name != "bilstm":
+            sizes["modules"] = found.modules
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            network = BiLSTM(len(names), found.action_size, layers, hidden)
-        sizes = {"name": "bilstm", "feature_size": len(names), "action_size": found.action_size, "layers": layers}
+            network = networks.build(sizes)
         checkpoints.save(
             {
                 "schema": checkpoints.SCHEMA,
                 "robot": found.to_dict(),
-                "network": {**sizes, "hidden": hidden, "dropout": 0.1, "history": history},
+                "network": sizes,
                 "features": names,
                 "weights": {name: gain * tensor for name, tensor in network.state_dict().items()},
                 "provenance": {"data_sha256": "0" * 64, "seed": seed, "errors_percent": [1.0, None]},

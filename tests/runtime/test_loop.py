@@ -1,130 +1,23 @@
-"""The loop on virtual time: a tracker, a model and a board that do what the test tells them."""
-
-from types import SimpleNamespace
+"""The loop on virtual time."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from virtual_loop import PERIOD_S, ROBOT, World
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.actuation import channel_pressures_bar
-from modsoft.runtime.clock import Ticker
-from modsoft.runtime.configuration import Window, bending_angle_deg, from_angles_deg, state_of
+from modsoft.runtime.configuration import Window, bending_angle_deg, state_of
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
 from modsoft.runtime.log import plain
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.protocol import CHANNELS, State
+from modsoft.runtime.protocol import CHANNELS
 from modsoft.runtime.rehearsal import Rehearsal
-from modsoft.runtime.safety import FrameJudge
-from modsoft.runtime.stop import Interrupted, Stop, StopKey
+from modsoft.runtime.stop import Interrupted, StopKey
 from modsoft.runtime.tally import Tally
-from modsoft.runtime.tracker import Frame, Slot
 
-ROBOT = robots.load("pneumatic-3")
-PERIOD_S = ROBOT.loop.period_s
 REST = np.array([[0.0, 0.0, 1.0]] * 3)
-
-
-class World:
-    """Virtual time with a robot that is at `angles(step)`, a tracker of 60 Hz, a board and a model.
-
-    `at[step]` is called when that step's turn has come, before the loop looks at anything.
-    """
-
-    def __init__(self, steps=10, robot=ROBOT):
-        self.robot = robot
-        self.time_s = 500.0
-        self.frame_age_s = 0.02
-        self.hidden = ()
-        self.slot = Slot()
-        self.slot.put(self.frame())
-        self.lines = []
-        self.stop = Stop()
-        self.at = {}
-        self.tracked = True
-        self.sent = []  # (time, wire tick, pressures)
-        self.beats = []
-        self.features = []
-        self.answer = lambda features: np.full((robot.modules, 1), 0.1)
-        self.work_s = 0.001
-        self.acknowledging = True
-        self.lost = None
-        # the board
-        self.status = SimpleNamespace(acked_seq=0, state=State.ARMED, faults=0, tick=0)
-        self.status_age_s = 0.05
-        self.ack_latency_s = None
-        self.applied_bar = np.zeros(CHANNELS)
-        self.measured_bar = np.full(CHANNELS, np.nan)
-        self.statistics = {"sets": 0}
-        # the model
-        self.history = 3
-        desired = from_angles_deg(np.outer(np.arange(steps), [1.0, 2.0, -3.0][: robot.modules]))
-        self.tally = Tally(robot, steps)
-        self.loop = Loop(
-            robot, self, desired, self.slot, FrameJudge(robot), self,
-            Ticker(PERIOD_S, lambda: self.time_s, self.wait), self.stop, self.lines.append, self.tally,
-        )  # fmt: skip
-
-    def frame(self, angles=(0.0, 0.0, 0.0), **changes):
-        at_s = self.time_s - self.frame_age_s
-        count = self.robot.modules + 1
-        poses = np.tile(np.eye(4), (count, 1, 1))
-        for tool, total in enumerate(np.radians(np.cumsum(angles[: count - 1])), 1):
-            poses[tool, :3, :3] = [[np.cos(total), 0, np.sin(total)], [0, 1, 0], [-np.sin(total), 0, np.cos(total)]]
-        valid = np.ones(count, bool)
-        valid[list(self.hidden)] = False
-        parts = {"poses": poses, "valid": valid, "quality": np.full(count, 0.1)}
-        return Frame(int(at_s * 60), at_s, **(parts | changes))
-
-    def hide(self, *tools):
-        """These are not seen from now on."""
-        self.hidden = tools
-
-    def due_s(self, step):
-        return 500.0 + (step + 1) * PERIOD_S
-
-    def wait(self, seconds):
-        self.time_s += seconds
-        for step in [step for step in self.at if self.time_s >= self.due_s(step) - 1e-6]:
-            self.at.pop(step)()
-        if self.tracked:
-            self.slot.put(self.frame())
-
-    # the board
-
-    def check(self):
-        if self.lost:
-            raise self.lost
-
-    def set_pressures(self, tick, pressures_bar):
-        self.check()
-        sequence = (len(self.sent) + 1) & 0xFF
-        self.sent.append((self.time_s, tick, np.array(pressures_bar)))
-        self.status.state, self.status.tick = State.RUNNING, tick
-        if self.acknowledging:
-            self.status.acked_seq, self.ack_latency_s = sequence, 0.007
-        return sequence
-
-    def beat(self, tick):
-        self.beats.append(tick)
-
-    # the model
-
-    def actuate(self, features):
-        self.features.append(features)
-        self.time_s += self.work_s
-        return self.answer(features)
-
-    # the test
-
-    def run(self):
-        self.loop.run(REST[: self.robot.modules])
-        return self
-
-    @property
-    def ticks(self):
-        return [line for line in self.lines if "tick" in line]
 
 
 def test_a_whole_task():

@@ -4,36 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
-from modsoft.runtime import robot as robots
 from modsoft.runtime import safety
 from modsoft.runtime.configuration import bending_angle_deg
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
 from modsoft.runtime.safety import FrameJudge, Guard, Judgement, check_actuation, check_rest
 from modsoft.runtime.tracker import Frame
-
-ROBOT = robots.load("pneumatic-3")
-PERIOD_S = ROBOT.loop.period_s
-MODULE_MM = 85.0
-
-
-def planar_poses(angles_deg, module_mm=MODULE_MM):
-    """Poses of a planar robot: module i ends `module_mm` further along the mean of its two ends' directions."""
-    poses = [np.eye(4)]
-    total, position = 0.0, np.zeros(3)
-    for angle in angles_deg:
-        middle = np.radians(total + angle / 2)
-        total += angle
-        position = position + module_mm * np.array([np.sin(middle), 0.0, np.cos(middle)])
-        pose = np.eye(4)
-        pose[:3, :3] = [
-            [np.cos(np.radians(total)), 0, np.sin(np.radians(total))],
-            [0, 1, 0],
-            [-np.sin(np.radians(total)), 0, np.cos(np.radians(total))],
-        ]
-        pose[:3, 3] = position
-        poses.append(pose)
-    return np.stack(poses)
 
 
 def frame(number, at_s, angles=(0.0, 0.0, 0.0), **changes):

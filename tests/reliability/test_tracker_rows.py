@@ -1,0 +1,254 @@
+"""Failure matrix, rows 13 to 19: what the tracker may do. On virtual time; on the real line in test_line_rows.py."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from virtual_loop import PERIOD_S, ROBOT, World, planar_poses, spoils
+
+from modsoft.runtime import safety
+from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.errors import LostInRun, Tripped
+from modsoft.runtime.safety import FrameJudge
+from modsoft.runtime.tracker import Frame, Slot
+
+VENT_LIMIT_S = 3 * PERIOD_S + 0.05  # from the last good frame on
+RUN_S = 8 * PERIOD_S  # of a run before its fault
+
+
+def ended(world):
+    """Runs until the tracker ends the run; seconds from the last good frame to the start of the venting."""
+    good_s = []
+    world.loop.judge.judge, judge = lambda *told: noted(judge(*told), told[0], good_s), world.loop.judge.judge
+    with pytest.raises((LostInRun, Tripped)):
+        world.run()
+    return world.time_s - good_s[-1]
+
+
+def noted(judged, frame, good_s):
+    if judged.good:
+        good_s.append(frame.monotonic_s)
+    return judged
+
+
+def held(world):
+    """Checks that each tick without a good frame sent the command of the tick before; how many there were."""
+    count = 0
+    for before, line in itertools.pairwise(world.ticks):
+        if line["verdict"] != "good":
+            assert line["raw"] is None
+            assert line["configuration"] is None
+            assert np.array_equal(line["actuation"], before["actuation"])
+            count += 1
+    return count
+
+
+def restless(world):
+    """A model whose answer is another one in every step, so that a held command shows."""
+    world.answer = lambda features: np.full((3, 1), 0.3 * np.sin(len(world.features)))
+    return world
+
+
+def test_row_13_tracker_off(matrix_row, full):
+    rng, tries, worst_s = np.random.default_rng(13), 10_000 if full else 200, 0.0
+    for _ in range(tries):
+        world = restless(World(steps=20))
+        world.frame_age_s = rng.uniform(0.002, 0.045)
+        world.dark.append((world.time_s + rng.uniform(PERIOD_S, RUN_S), np.inf))
+        worst_s = max(worst_s, ended(world))
+        held(world)
+    matrix_row(13, fault="tracker off", tries=tries, limit="vent 1.25 s after the last good frame",
+               worst=f"{worst_s:.3f} s", clock="virtual")  # fmt: skip
+    assert worst_s <= VENT_LIMIT_S
+    ticks = most = 0
+    for _ in range(tries // 10):
+        world, at_s = restless(World(steps=50)), 500.0
+        while at_s < world.due_s(50):
+            at_s += rng.uniform(1.2 * PERIOD_S, 2.5 * PERIOD_S)
+            world.dark.append((at_s, at_s := at_s + rng.uniform(0.0, 2 * PERIOD_S)))
+        world.run()
+        most, ticks = max(most, held(world)), ticks + len(world.ticks)
+        assert len(world.sent) == 51
+    matrix_row(13, fault="tracker intermittent, up to 0.8 s", tries=ticks, limit="command held, run goes on",
+               worst=f"{most} of 50 ticks held", clock="virtual")  # fmt: skip
+    assert most >= 5
+
+
+def test_row_14_tracker_frozen(matrix_row, full):
+    rng, tries, worst, worst_s = np.random.default_rng(14), 10_000 if full else 200, 0, 0.0
+    for _ in range(tries):
+        world = restless(World(steps=20))
+        world.frame_age_s = rng.uniform(0.002, 0.045)
+        frozen_s = world.time_s + rng.uniform(PERIOD_S, RUN_S)
+        number = int(frozen_s * 60)
+        world.spoilt.append((frozen_s, np.inf, spoils(device_frame=number)))  # fresh by the host's clock
+        worst_s = max(worst_s, ended(world))
+        used = [line for line in world.ticks if line["verdict"] == "good" and line["frame"]["number"] == number]
+        worst = max(worst, len(used) + 1)
+    matrix_row(14, fault="tracker frozen, the same frame again", tries=tries, limit="found within 3 ticks",
+               worst=f"tick {worst}, vent after {worst_s:.3f} s", clock="virtual")  # fmt: skip
+    assert worst <= 3
+    assert worst_s <= VENT_LIMIT_S
+
+    hours, verdicts = 10 if full else 1, []
+    world = World(steps=round(hours * 3600 / PERIOD_S))
+    world.log = lambda line: verdicts.append(line["verdict"]) if "tick" in line else None
+    world.frame = lambda: noise(rng, world.time_s)
+    world.run()
+    alarms = len(verdicts) - verdicts.count("good")
+    matrix_row(14, fault="none: noise of 0.5 mm and 0.5 degrees, jitter of the line, clocks 100 ppm apart",
+               tries=len(verdicts), limit=f"no false alarm in {hours} h", worst=alarms, clock="virtual")  # fmt: skip
+    assert alarms == 0
+
+
+def noise(rng, now_s):
+    """A frame of a working tracker that looks at a moving robot."""
+    age_s = rng.uniform(0.002, 0.045)
+    angles = np.array([5.0, 30.0, 80.0]) * np.sin(2 * np.pi * now_s / 80.0) + rng.normal(0, 0.5, 3)
+    poses = planar_poses(angles)
+    poses[:, :3, 3] += rng.normal(0, 0.5, (4, 3))
+    number = int((now_s - age_s - rng.uniform(0, 0.017)) * 60 * 1.0001)
+    return Frame(number, now_s - age_s, poses, np.ones(4, bool), np.full(4, 0.1), 60.0)
+
+
+def test_row_15_delayed(matrix_row, full):
+    """Frames that are late on the line, which the host sees, or in the device, which only its count tells."""
+    rng, tries, used, worst_s = np.random.default_rng(15), 1_000_000 if full else 20_000, 0, 0.0
+    judge, now_s, seen_s = FrameJudge(ROBOT), 1000.0, 0.0
+    for step in range(tries):
+        now_s += PERIOD_S
+        late = rng.choice(["no", "line", "device", "both"], p=[0.4, 0.2, 0.2, 0.2]) if step >= 10 else "no"
+        on_line_s = rng.uniform(0.0, 1.5 if late in ("line", "both") else 0.045)
+        in_device_s = rng.uniform(0.0, 1.5) if late in ("device", "both") else 0.0
+        number = int((now_s - on_line_s - in_device_s) * 60)
+        in_device_s = now_s - on_line_s - number / 60 if in_device_s else 0.0
+        on_line_s = now_s - number / 60 - in_device_s
+        frame = Frame(number, now_s - on_line_s, planar_poses((1.0, 2.0, 3.0)), np.ones(4, bool), np.full(4, 0.1), 60.0)
+        if judge.judge(frame, now_s).good:
+            assert number / 60 > seen_s, "an older frame after a newer one"
+            used, seen_s = used + 1, number / 60
+            worst_s = max(worst_s, on_line_s + in_device_s)
+    matrix_row(15, fault="frames delayed by up to 3 s, on the line and in the device", tries=tries,
+               limit="0 older than a period (0.4 s) used", worst=f"0; oldest of {used} used {worst_s:.3f} s",
+               clock="virtual")  # fmt: skip
+    assert worst_s <= PERIOD_S
+    assert used > 0.3 * tries
+
+
+def test_row_16_nan(matrix_row, full):
+    rng, tries = np.random.default_rng(16), 100_000 if full else 10_000
+    world = restless(World(steps=round(1.5 * tries)))
+    world.log = lambda line: counts.append(line["verdict"]) if "tick" in line else None
+    counts, frame = [], world.frame
+
+    def sometimes(**changes):
+        """Two of three ticks see a frame that is spoilt somewhere."""
+        seen = frame(**changes)
+        if int((world.time_s - 500.0 + 0.2) / PERIOD_S) % 3 == 0:
+            return seen
+        poses = seen.poses.copy()
+        for _ in range(rng.integers(1, 4)):
+            poses[rng.integers(4), rng.integers(3), rng.integers(4)] = rng.choice([np.nan, np.inf, -np.inf])
+        return dataclasses.replace(seen, poses=poses)
+
+    world.frame = sometimes
+    world.run()
+    refused = counts.count(safety.NOT_FINITE)
+    assert refused >= 0.99 * tries
+    assert counts.count("good") == len(counts) - refused == len(world.features)
+    reached = sum(not np.isfinite(features).all() for features in world.features)
+    matrix_row(16, fault="NaN and infinity in poses that call themselves valid", tries=refused,
+               limit="0 reach the model", worst=reached, clock="virtual")  # fmt: skip
+    assert reached == 0
+    assert all(np.isfinite(bar).all() for *_, bar in world.sent)
+
+
+def test_row_17_outlier(matrix_row, full):
+    rng, tries, worst = np.random.default_rng(17), 10_000 if full else 300, 0
+    fastest_deg = 180.0 * ROBOT.limits.largest_actuation_step + safety.NOISE_DEG  # in one period
+    for _ in range(tries):
+        world, module = restless(World(steps=12)), rng.integers(3)
+        angles = np.zeros(3)
+        angles[module] = rng.choice([-1, 1]) * rng.uniform(1.05 * fastest_deg, 180.0)
+        poses = planar_poses(angles)
+        at_s = world.due_s(6) - world.frame_age_s
+        world.spoilt.append((at_s - rng.uniform(0.0, PERIOD_S / 2), at_s + 0.001, spoils(poses=poses)))
+        world.run()
+        refused = [line["tick"] for line in world.ticks if line["verdict"] != "good"]
+        assert refused[0] == 6
+        assert world.ticks[6]["verdict"] in (safety.JUMP, safety.SWAPPED)
+        assert held(world) == len(refused)
+        worst = max(worst, len(refused))
+        used = [line["configuration"] for line in world.ticks if line["verdict"] == "good"]
+        assert np.all(bending_angle_deg(used) == 0.0)
+    matrix_row(17, fault="a frame that jumps by more than the fastest motion", tries=tries,
+               limit="command held on that tick, back within 3", worst=f"after {worst}", clock="virtual")  # fmt: skip
+    assert worst <= 3
+
+
+def random_partial(rng):
+    """(what, spoil): some way in which a frame's state is not the whole state."""
+    count = ROBOT.modules + 1
+    match rng.integers(4):
+        case 0:
+            valid = np.ones(count, bool)
+            valid[rng.choice(count, rng.integers(1, count + 1), replace=False)] = False
+            return "hidden", spoils(valid=valid)
+        case 1:
+            tools = rng.choice([0, 1, 2, 3, 5, 8])
+            parts = {"poses": np.tile(np.eye(4), (tools, 1, 1)), "valid": np.ones(tools, bool)}
+            return "wrong number", spoils(**parts, quality=np.full(tools, 0.1))
+        case 2:
+            return "wrong number", spoils(valid=np.ones(rng.choice([0, 1, 3, 5]), bool))
+        case _:
+            j, k = rng.choice(count, 2, replace=False)
+            order = np.arange(count)
+            order[[j, k]] = k, j
+            return "swapped", lambda frame: dataclasses.replace(frame, poses=frame.poses[order])
+
+
+def test_row_18_hidden_wrong_number_swapped(matrix_row, full):
+    rng, tries, worst_s, kinds = np.random.default_rng(18), 10_000 if full else 300, 0.0, set()
+    for _ in range(tries):
+        world = restless(World(steps=20))
+        world.frame_age_s = rng.uniform(0.002, 0.045)
+        world.angles = tuple(rng.uniform(-1, 1, 3) * [6.0, 36.0, 90.0])
+        what, spoil = random_partial(rng)
+        kinds.add(what)
+        world.spoilt.append((world.time_s + rng.uniform(PERIOD_S, RUN_S), np.inf, spoil))
+        worst_s = max(worst_s, ended(world))
+        bad = [line for line in world.ticks if line["verdict"] != "good"]
+        assert len(bad) == 3
+        assert world.ticks[-3:] == bad
+        held(world)
+    assert kinds == {"hidden", "wrong number", "swapped"}
+    matrix_row(18, fault="tools hidden, of a wrong number, swapped", tries=tries,
+               limit="no partial state used; vent 1.25 s after the last good frame", worst=f"0; {worst_s:.3f} s",
+               clock="virtual")  # fmt: skip
+    assert worst_s <= VENT_LIMIT_S
+
+
+def test_row_19_numbers_backwards(matrix_row, full):
+    rng, tries, used, dropped = np.random.default_rng(19), 1_000_000 if full else 20_000, 0, 0
+    slot, judge = Slot(), FrameJudge(ROBOT)
+    good, newest, last, now_s = planar_poses((1.0, 2.0, 3.0)), -1, -1, 1000.0
+    for step in range(tries):
+        now_s += 1 / 60
+        back = rng.choice([0, rng.integers(1, 100), rng.integers(100, 60_000)], p=[0.5, 0.3, 0.2])
+        number = int(now_s * 60) - back
+        frame = Frame(number, now_s, good, np.ones(4, bool), np.full(4, 0.1), 60.0)
+        slot.put(frame)
+        dropped += number <= newest
+        newest = max(newest, number)
+        seen = frame if step % 2 else slot.latest()  # the judge does not count on the slot
+        if judge.judge(seen, now_s + 0.001).good:
+            used += seen.device_frame <= last
+            last = seen.device_frame
+    assert slot.counts["repeated"] + slot.counts["backwards"] == dropped
+    assert sum(slot.counts.values()) == tries
+    matrix_row(19, fault="frame numbers that go backwards", tries=dropped, limit="0 used, each counted", worst=used,
+               clock="virtual")  # fmt: skip
+    assert used == 0
+    assert dropped > 0.3 * tries
+    assert last > 0.99 * newest

@@ -1,0 +1,108 @@
+"""The runtime's own host side on an emulated MEGA in mid-run, for faults of board, cable and bootloader.
+
+Run as a program, `python mega_in_run.py PORT...`, it drives the boards at these ports until it is killed, and prints a
+line as soon as all of them are at `Host.BAR`.
+"""
+
+import contextlib
+import random
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from modsoft.hil.emulator import EmulatedBoard
+from modsoft.runtime import robot as robots
+from modsoft.runtime.board import Board
+from modsoft.runtime.ports import open_port
+from modsoft.runtime.protocol import State
+
+CHECK_S = 0.005  # how often the real loop looks between two ticks
+
+
+class Host:
+    """Six chambers at `BAR`, a set-point every `PERIOD_S`.
+
+    threaded: False leaves the port to the caller's thread, which may then take over the wire itself.
+    """
+
+    BAR = 0.35  # the most that the shipped robot allows: the longest way down
+    PERIOD_S = 0.4
+    ROBOT = robots.load("pneumatic-3")
+
+    def __init__(self, port_name, threaded=True):
+        self.written = []  # (monotonic seconds, bytes)
+        self.port = open_port(port_name, self.ROBOT.serial.baud)
+        self.port.write = self._recorded(self.port.write)
+        self.threaded = threaded
+        self.board = Board(self.port, port_name, threaded=threaded)
+        self.tick = 0
+        self.due_s = time.monotonic()
+
+    def _recorded(self, write):
+        def recorded(data):
+            self.written.append((time.monotonic(), data))
+            return write(data)
+
+        return recorded
+
+    def start(self):
+        """Arm, and go on until the board has said that every chamber is told `BAR`."""
+        self.board.arm(self.ROBOT)
+        self.go_on(3 * self.PERIOD_S)
+        assert self.board.status.state == State.RUNNING
+        assert min(self.board.applied_bar[:6]) == self.BAR
+
+    def go_on(self, seconds):
+        """The control loop for so long. Raises what `Board.check` raises, as soon as the loop can know."""
+        until_s = time.monotonic() + seconds
+        while (now_s := time.monotonic()) < until_s:
+            self.board.check()
+            if now_s >= self.due_s:
+                self.tick += 1
+                self.due_s = now_s + self.PERIOD_S
+                self.board.set_pressures(self.tick, np.full(6, self.BAR))
+            if self.threaded:
+                time.sleep(max(0.0, min(self.due_s, until_s, now_s + CHECK_S) - now_s))
+            else:
+                self.board._pump()
+
+
+@contextlib.contextmanager
+def in_run(threaded=True):
+    """(host, emulated board) in mid-run, at a random phase of the period."""
+    with EmulatedBoard("simavr") as emulated:
+        emulated.send("sensors 20")
+        host = Host(emulated.port, threaded)
+        try:
+            host.start()
+            host.go_on(random.uniform(0.0, Host.PERIOD_S))
+            yield host, emulated
+        finally:
+            host.board._shut()
+
+
+def inject(emulated, command, name="command"):
+    """Give the board a command; its event `name`, and how long the trace was before it."""
+    since = len(emulated.trace)
+    emulated.send(command)
+    return emulated.wait_for(lambda event: event["event"] == name, 5.0, since), since
+
+
+def side_by_side(tries, attempt, at_once=5):
+    """What `attempt(number)` returns, for every number below `tries`, several at once: a board is mostly idle."""
+    with ThreadPoolExecutor(at_once) as pool:
+        return list(pool.map(attempt, range(tries)))
+
+
+def main(ports):
+    """Drive the boards at these ports for ever."""
+    hosts = side_by_side(len(ports), lambda number: Host(ports[number]), len(ports))
+    side_by_side(len(hosts), lambda number: hosts[number].start(), len(hosts))
+    print("in run", flush=True)
+    side_by_side(len(hosts), lambda number: hosts[number].go_on(3600.0), len(hosts))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
