@@ -25,8 +25,9 @@
  *   watchdog, reset (cause: power-on, external, watchdog), hang, halted
  *   late       emulated time gave way by late_us
  *   command    line, done: the echo of every command but `adc`
- *   stats, summary   times, lateness, share of a core, byte counters; firmware_slept_us and firmware_max_awake_us: how much
- *              the firmware slept since the last reset, and its longest time without (its worst loop)
+ *   stats, summary   times, lateness, share of a core, byte counters; rx_bootloader: bytes that the host wrote while the
+ *              board was in reset or in its bootloader; firmware_slept_us and firmware_max_awake_us: how much the firmware
+ *              slept since the last reset, and its longest time without (its worst loop)
  *
  * Known differences from the chip: a new compare value shows at once, not at the end of the PWM period (256 us); a pin
  * whose timer is connected but stopped counts as 0; ADC8..15 are not there; sleep takes no time to wake from.
@@ -117,9 +118,14 @@ void board_power_cycle(void)
     enter_reset("power-on");
 }
 
+bool board_runs_firmware(void)
+{
+    return !held_until && !(avr->reset_pc && avr->pc >= avr->reset_pc);
+}
+
 bool board_hang(bool deaf)
 {
-    if (hang.on || held_until || (avr->reset_pc && avr->pc >= avr->reset_pc))
+    if (hang.on || !board_runs_firmware())
         return false; /* the bootloader has no watchdog */
     hang.at = avr->pc;
     hang.on = true;

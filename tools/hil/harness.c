@@ -136,15 +136,16 @@ static void report_statistics(const char *name)
           "\"emulated_s\":%.6f,\"wall_s\":%.6f,\"cpu_s\":%.3f,\"percent_of_real_time\":%.3f,\"percent_of_core\":%.2f,"
           "\"slices\":%llu,\"late_slices\":%llu,\"max_late_us\":%.1f,\"slipped_us\":%.1f,\"pwm_events\":%llu,\"resets\":%llu,"
           "\"firmware_slept_us\":%.1f,\"firmware_max_awake_us\":%.1f,"
-          "\"rx\":%llu,\"tx\":%llu,\"rx_overrun\":%llu,\"tx_unread\":%llu,\"rx_corrupted\":%llu,\"rx_dropped\":%llu,"
+          "\"rx\":%llu,\"tx\":%llu,\"rx_bootloader\":%llu,\"rx_overrun\":%llu,\"tx_unread\":%llu,\"rx_corrupted\":%llu,\"rx_dropped\":%llu,"
           "\"tx_corrupted\":%llu,\"tx_dropped\":%llu,\"wrong_baud\":%llu",
           emulated_s, wall_s, cpu_s, wall_s > 0 ? 100 * emulated_s / wall_s : 0, wall_s > 0 ? 100 * cpu_s / wall_s : 0,
           (unsigned long long)slices, (unsigned long long)late_slices, max_late_ns * 1e-3, slipped_ns * 1e-3,
           (unsigned long long)pwm_events, (unsigned long long)resets, (double)board_load.slept / TICKS_PER_US,
           (double)board_load.max_awake / TICKS_PER_US,
-          (unsigned long long)c->rx, (unsigned long long)c->tx, (unsigned long long)c->rx_overrun,
-          (unsigned long long)c->tx_unread, (unsigned long long)c->rx_corrupted, (unsigned long long)c->rx_dropped,
-          (unsigned long long)c->tx_corrupted, (unsigned long long)c->tx_dropped, (unsigned long long)c->wrong_baud);
+          (unsigned long long)c->rx, (unsigned long long)c->tx, (unsigned long long)c->rx_bootloader,
+          (unsigned long long)c->rx_overrun, (unsigned long long)c->tx_unread, (unsigned long long)c->rx_corrupted,
+          (unsigned long long)c->rx_dropped, (unsigned long long)c->tx_corrupted, (unsigned long long)c->tx_dropped,
+          (unsigned long long)c->wrong_baud);
 }
 
 /* Pressure sensors that follow their valves with a first-order lag, in emulated time: no round trip through the host. */

@@ -44,6 +44,7 @@ ticks_t board_now(void);
 void board_run(ticks_t until); /* may overshoot by one instruction */
 void board_reset_pin(void);    /* what DTR does when the port is opened */
 void board_power_cycle(void);  /* a reset that also loses the RAM */
+bool board_runs_firmware(void); /* false: in reset, or in the bootloader */
 bool board_hang(bool deaf);    /* no progress in the main loop until the next reset, interrupts off too if deaf; false: not now */
 void board_set_adc(unsigned input, unsigned millivolt);
 
@@ -51,6 +52,7 @@ void board_set_adc(unsigned input, unsigned millivolt);
 
 struct line_counters {
     uint64_t rx, tx;                   /* bytes that the board received, sent */
+    uint64_t rx_bootloader;            /* that the host wrote while the board was in reset or in its bootloader */
     uint64_t rx_corrupted, rx_dropped; /* by the injected noise */
     uint64_t tx_corrupted, tx_dropped;
     uint64_t rx_overrun;               /* lost in the UART: the firmware was too slow */

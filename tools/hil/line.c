@@ -143,6 +143,8 @@ void line_poll(void)
         ssize_t got = read(master, bytes, RX_ROOM - rx_count);
         if (got <= 0)
             break;
+        if (!board_runs_firmware())
+            line_counters.rx_bootloader += (uint64_t)got;
         for (ssize_t i = 0; i < got; i++)
             rx[(rx_first + rx_count++) % RX_ROOM] = bytes[i];
     }

@@ -118,6 +118,11 @@ void board_power_on(const struct options *options)
     board_power_cycle();
 }
 
+bool board_runs_firmware(void)
+{
+    return now >= started;
+}
+
 bool board_hang(bool deaf)
 {
     (void)deaf; /* there are no interrupts here */
