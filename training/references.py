@@ -36,7 +36,7 @@ def random_reference(modules: int, *, seed: int, steps: int = SIMULATED_STEPS) -
     depths, azimuths_deg = [depth[None]], [azimuth_deg[None]]
     while sum(map(len, depths)) < steps:
         length = int(random.integers(SHORTEST_STEPS, LONGEST_STEPS + 1))
-        kind = random.choice(["spiral", "arc", "stay"], p=[0.5, 0.35, 0.15])
+        kind = random.choice(["spiral", "arc", "stay"], p=[0.5, 0.35, 0.15]) if depth.any() else "spiral"
         after = _depth(random, modules) if kind == "spiral" else depth
         rate_deg = 0.0 if kind == "stay" else random.uniform(-FASTEST_DEG, FASTEST_DEG, 1 if together else modules)
         share = np.arange(1, length + 1)[:, None]
@@ -53,7 +53,7 @@ def random_reference(modules: int, *, seed: int, steps: int = SIMULATED_STEPS) -
 def _largest_deg(random: np.random.Generator, modules: int) -> Array:
     """The largest bend of each module; the tip's is always large, as in the tasks."""
     largest = FARTHEST_DEG * random.random(modules)
-    largest[-1] = FARTHEST_DEG * random.uniform(0.7, 1.0)
+    largest[-1] = FARTHEST_DEG * random.uniform(0.85, 1.0)
     largest[:-1] *= min(1.0, (WHOLE_DEG - largest[-1]) / largest[:-1].sum())
     return largest
 
