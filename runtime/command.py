@@ -25,6 +25,7 @@ EXTRAS = {
     "modsoft-train": "train",
     "modsoft-export": "export",
     "modsoft-hil": "hil",
+    "modsoft-evaluate": "study",
 }
 
 

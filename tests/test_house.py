@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PARTS = {"runtime": 0, "training": 1, "export": 2, "hil": 3}
-FOLDERS = {"runtime": "runtime", "training": "training", "export": "export", "hil": "tools/hil"}
+PARTS = {"runtime": 0, "training": 1, "export": 2, "hil": 3, "study": 3}
+FOLDERS = {"runtime": "runtime", "training": "training", "export": "export", "hil": "tools/hil", "study": "tools/study"}
 HEAVY = {"torch", "onnx", "elastica", "h5py", "matplotlib", "numba", "tqdm"}
 
 

@@ -28,10 +28,10 @@ def wheel(tmp_path_factory):
     return next(folder.glob("modsoft-*.whl"))
 
 
-def test_wheel_holds_the_four_parts_and_nothing_else(wheel):
+def test_wheel_holds_the_five_parts_and_nothing_else(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     tops = {"/".join(name.split("/")[:2]) for name in names if not name.split("/")[0].endswith(".dist-info")}
-    assert tops == {"modsoft/runtime", "modsoft/training", "modsoft/export", "modsoft/hil"}
+    assert tops == {"modsoft/runtime", "modsoft/training", "modsoft/export", "modsoft/hil", "modsoft/study"}
     for robot in ("cable-4", "cable-6", "pneumatic-2", "pneumatic-3"):
         assert f"modsoft/runtime/robots/{robot}.toml" in names
     # the emulated board links a GPL library: a test tool of the checkout, never distributed

@@ -6,7 +6,7 @@ cd "$(dirname "$0")/.."
 bin=.venv/bin
 mkdir -p build/types/modsoft
 for part in runtime training export; do ln -sfn "../../../$part" "build/types/modsoft/$part"; done
-ln -sfn ../../../tools/hil build/types/modsoft/hil
+for part in hil study; do ln -sfn "../../../tools/$part" "build/types/modsoft/$part"; done
 "$bin/ruff" check .
 "$bin/python" tools/gen_protocol.py --check
-"$bin/mypy" -p modsoft.runtime -p modsoft.export -p modsoft.hil -p modsoft.training
+"$bin/mypy" -p modsoft.runtime -p modsoft.export -p modsoft.hil -p modsoft.training -p modsoft.study

@@ -69,7 +69,7 @@ def run(task: Callable[[Item], None], items: list[Item], jobs: int) -> Iterator[
 def _answer(connection: Connection) -> Any:
     try:
         answer = connection.recv()
-    except EOFError:
+    except (EOFError, ConnectionResetError):
         raise WorkerLost("a worker process died (killed, or out of memory); run again to go on") from None
     if isinstance(answer, Exception):
         raise answer

@@ -1,0 +1,164 @@
+"""The pictures of the study, in the places of the paper's Figures 4 to 8, S3 and S4."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from modsoft.runtime.files import written
+from modsoft.study import flights, measure, paper
+from modsoft.study.cells import Cell, cell, pick
+from modsoft.study.folder import Folder
+from modsoft.study.measure import CONTROL, ESTIMATION, Record
+from modsoft.study.plan import CORRECTIONS, MAIN, TASKS, Model, Plan, Run
+from modsoft.training import coverage
+from modsoft.training.evaluate import configuration_errors_percent
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WORKSPACE = "figure-4"
+PATHS = (
+    "Components v_x and v_y of each module's configuration along tasks A, B and C: desired (dashed), reached by the "
+    "network alone, and with the correction (seed {seed})."
+)
+ERRORS = (
+    "Left: mean configuration error of each module over seeds and steps (bars; thin lines: standard deviation over the "
+    "steps), beside the paper's and the floor; task B without its first five steps. Right: the error of every step, "
+    "mean over the modules, network alone and with the correction (seed {seed})."
+)
+CAPTIONS = {
+    WORKSPACE: "Figure 4. Where the module ends of the staged and the traditional data were, as many samples of each, "
+    "from the side and along the axis.",
+    "figure-5": "Figure 5. Actuation estimation error of the networks, mean over the seeds; thin lines: standard "
+    "deviation over the test windows.",
+    "figure-6": "Figure 6. Four modules, LSTM. " + PATHS.format(seed=0),
+    "figure-7": "Figure 7. Four modules, biLSTM on rich data. " + PATHS.format(seed=0),
+    "figure-8": "Figure 8. Six modules, biLSTM trained on four. " + PATHS.format(seed=0),
+    "figure-s3": "Figure S3. Four modules, biLSTM on rich data. " + ERRORS.format(seed=0),
+    "figure-s4": "Figure S4. Six modules, biLSTM trained on four. " + ERRORS.format(seed=0),
+}
+COLOURS = {"paper": "#9a9a9a", "none": "#1f77b4", "integral": "#2ca02c", "floor": "#d62728"}
+WORDS = {"paper": "paper", "none": "network alone", "integral": "with correction", "floor": "floor"}
+DPI = 110
+
+
+def draw(plan: Plan, folder: Folder) -> None:
+    """Writes all of figures/*.png."""
+    records = measure.load(folder.results)["records"]
+    main, seed = MAIN, plan.seeds[0]
+    lstm, bilstm = Model("lstm", "paper", "blocks", seed), Model(*main, "blocks", seed)
+    coverage.draw(
+        coverage.compare([folder.data("paper"), folder.data("traditional")]), folder.figures / f"{WORKSPACE}.png"
+    )
+    made = {
+        "figure-5": estimation(records),
+        "figure-6": paths(folder, lstm, 4),
+        "figure-7": paths(folder, bilstm, 4),
+        "figure-8": paths(folder, bilstm, 6),
+        "figure-s3": errors(records, folder, bilstm, 4),
+        "figure-s4": errors(records, folder, bilstm, 6),
+    }
+    for name, figure in made.items():
+        with written(folder.figures / f"{name}.png") as temporary:
+            figure.savefig(temporary, dpi=DPI, format="png")
+
+
+def estimation(records: Sequence[Record]) -> Figure:
+    """A panel for each network and data, a group of bars for each module."""
+    figure = _figure(10.0, 3.6)
+    of_table = pick(records, table="1", quantity=ESTIMATION)
+    ours = pick(of_table, source="study")
+    kinds = list(dict.fromkeys((record["network"], record["data"]) for record in ours))
+    panels = figure.subplots(1, len(kinds), squeeze=False)[0]
+    for panel, (network, data) in zip(panels, kinds, strict=True):
+        theirs = pick(of_table, source="paper", network=network)
+        modules = sorted({record["module"] for record in ours})
+        of_kind = pick(ours, network=network, data=data)
+        bars = {"paper (shuffled)": ("#9a9a9a", [cell(theirs, module=module) for module in modules])}
+        for split, colour in (("shuffled", "#aec7e8"), ("blocks", "#1f77b4")):
+            found = [cell(of_kind, split=split, module=module) for module in modules]
+            if any(found):
+                bars[split] = (colour, found)
+        _bars(panel, modules, bars)
+        panel.set(title=f"{network}, {data} data", xlabel="module")
+    panels[0].set_ylabel("estimation error, %")
+    return figure
+
+
+def _bars(panel: Axes, modules: list[int], bars: dict[str, tuple[str, list[Cell | None]]]) -> None:
+    """Groups of bars, one a module; a thin line up from each says its standard deviation."""
+    width = 0.8 / len(bars)
+    for place, (name, (colour, cells)) in enumerate(bars.items()):
+        at = np.array(modules) + (place - (len(bars) - 1) / 2) * width
+        means = np.array([each.mean if each else np.nan for each in cells])
+        spread = np.array([each.std if each and each.std is not None else np.nan for each in cells])
+        panel.bar(at, means, width, color=colour, label=name)
+        panel.errorbar(at, means, [np.zeros_like(spread), spread], fmt="none", ecolor="#333333", lw=0.7)
+    panel.set_xticks(modules)
+    panel.grid(axis="y", alpha=0.3)
+    panel.legend(fontsize=7)
+
+
+def paths(folder: Folder, model: Model, modules: int) -> Figure:
+    """Tasks below each other, modules side by side."""
+    figure = _figure(1.2 + 2.3 * modules, 7.4)
+    panels = figure.subplots(len(TASKS), modules, squeeze=False)
+    for row, task in enumerate(TASKS):
+        kept = {each: flights.read(folder.run(Run(model, task, modules, each))) for each in CORRECTIONS}
+        desired = kept["none"].desired
+        for module in range(modules):
+            panel = panels[row, module]
+            for correction, run in kept.items():
+                reached = run.flight.configuration[: len(desired), module]
+                panel.plot(*reached[:, :2].T, color=COLOURS[correction], lw=1.2, label=WORDS[correction])
+            panel.plot(*desired[:, module, :2].T, color="black", ls="--", lw=0.9, label="desired")
+            panel.set_aspect("equal", "datalim")
+            panel.grid(alpha=0.3)
+            panel.tick_params(labelsize=7)
+            panel.set_title(f"task {task}, module {module + 1}", fontsize=9)
+        panels[row, 0].set_ylabel("v_y", fontsize=9)
+    for panel in panels[-1]:
+        panel.set_xlabel("v_x", fontsize=9)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+def errors(records: Sequence[Record], folder: Folder, model: Model, modules: int) -> Figure:
+    """Tasks below each other: bars by module, and the error over the steps."""
+    figure = _figure(11.0, 8.0)
+    panels = figure.subplots(len(TASKS), 2, squeeze=False, width_ratios=[1.0, 1.2])
+    of_table = pick(records, table={4: "2", 6: "3"}[modules], quantity=CONTROL, modules=modules)
+    ours = pick(of_table, source="study", network=model.network, data=model.data)
+    numbers = list(range(1, modules + 1))
+    for row, task in enumerate(TASKS):
+        here: dict[str, Any] = {"task": task, "skip_first": paper.JUMP_STEPS if task == "B" else 0}
+        sources = {"paper": pick(of_table, source="paper", network=model.network)}
+        sources |= {correction: pick(ours, correction=correction) for correction in CORRECTIONS}
+        sources["floor"] = pick(of_table, source="floor")
+        bars = {}
+        for name, found in sources.items():
+            cells = [cell(found, module=module, **here) for module in numbers]
+            if any(cells):
+                bars[WORDS[name]] = (COLOURS[name], cells)
+        _bars(panels[row, 0], numbers, bars)
+        panels[row, 0].set(title=f"task {task}", ylabel="configuration error, %")
+        for correction in CORRECTIONS:
+            kept = flights.read(folder.run(Run(model, task, modules, correction)))
+            of_steps = configuration_errors_percent(kept.flight.configuration, kept.desired).mean(axis=1)
+            panels[row, 1].plot(of_steps, color=COLOURS[correction], lw=1.0, label=WORDS[correction])
+        panels[row, 1].set(yscale="log", title=f"task {task}")
+        panels[row, 1].grid(alpha=0.3, which="both")
+        panels[row, 1].legend(fontsize=7)
+    panels[-1, 0].set_xlabel("module")
+    panels[-1, 1].set_xlabel("control step")
+    return figure
+
+
+def _figure(width_in: float, height_in: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), layout="constrained")

@@ -1,0 +1,152 @@
+"""Every closed-loop run of the study: exported models on simulated robots, many at once, each kept as an .npz."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+import json
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime import actuation, configuration, controller, trajectory
+from modsoft.runtime import correction as corrections
+from modsoft.runtime import robot as robots
+from modsoft.runtime.controller import Controller
+from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import written
+from modsoft.runtime.trajectory import task
+from modsoft.study import disturb, making, work
+from modsoft.study.folder import Folder
+from modsoft.study.plan import Plan, Run
+from modsoft.training import evaluate, fleet
+from modsoft.training import robots as parameters
+from modsoft.training.evaluate import Flight, Pilot, fly
+from modsoft.training.fleet import simulated
+
+TOGETHER = 16  # robots of a batch: two blocks of the kernel's widest vectors
+# The code that shapes a run beside the model and the kernel.
+SHAPES: tuple[ModuleType, ...] = (
+    actuation, configuration, controller, corrections, trajectory, evaluate, fleet, parameters, disturb,
+)  # fmt: skip
+STEP_S = 3.2e-3  # of one core, for a control step of one robot of four modules, about
+
+Array = NDArray[np.float64]
+
+
+class Kept(NamedTuple):
+    """A run as it lies in the folder."""
+
+    flight: Flight
+    desired: Array  # (K, N, 3)
+
+
+def fly_all(plan: Plan, folder: Folder, jobs: int) -> None:
+    """runs/*.npz. A run is made again when its model changed, or anything else that shapes it."""
+    folder.make()
+    seals = {model: making.seal(folder, model) for model in {run.model for run in plan.runs}}
+    missing = [run for run in plan.runs if meta(folder.run(run)) != identity(plan, run, seals[run.model])]
+    batches = [
+        tuple(batch)
+        for alike in _alike(missing)
+        for batch in (alike[first : first + TOGETHER] for first in range(0, len(alike), TOGETHER))
+    ]
+    work.spread("fly", partial(_fly, plan, folder), batches, partial(fly_s, plan), jobs)
+
+
+def fly_s(plan: Plan, batch: Sequence[Run]) -> float:
+    return (plan.steps or 250) * STEP_S * batch[0].modules / 4 * max(8, len(batch))
+
+
+def _alike(runs: Sequence[Run]) -> list[list[Run]]:
+    """Runs that can share a fleet: as many modules, the same plant."""
+
+    def of_fleet(run: Run) -> tuple[int, str]:
+        return run.modules, repr(disturb.plant(run.disturbance, run.modules, run.model.seed))
+
+    return [list(group) for _, group in itertools.groupby(sorted(runs, key=of_fleet), key=of_fleet)]
+
+
+def identity(plan: Plan, run: Run, seal: str) -> dict[str, Any]:
+    """All that the numbers of a run depend on, as plain values."""
+    return {
+        "model": run.model.name,
+        "model_sha256": seal,
+        "task": run.task,
+        "modules": run.modules,
+        "correction": run.correction,
+        "disturbance": run.disturbance,
+        "seed": run.model.seed,
+        "steps": len(desired_of(plan, run.task, run.modules)),
+        "code_sha256": code_sha256(),
+    }
+
+
+@functools.cache
+def code_sha256() -> str:
+    """Of the source of all that shapes a run. Runs are cheap, so they are made again rather than be doubtful."""
+    digest = hashlib.sha256()
+    for module in SHAPES:
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()
+
+
+def desired_of(plan: Plan, name: str, modules: int) -> Array:
+    """The task (K, N, 3), cut where the plan has shorter ones."""
+    return task(name, "cable", modules)[: plan.steps]
+
+
+def _fly(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: work.Told) -> None:
+    first = batch[0]
+    robot = robots.load(f"cable-{first.modules}")
+    models = {run.model: Controller.load(folder.onnx(run.model)) for run in batch}
+    for model in models.values():
+        model.check(robot)
+    pilots = [
+        Pilot(
+            models[run.model].actuate,
+            models[run.model].history,
+            desired_of(plan, run.task, run.modules),
+            corrections.named(run.correction, run.modules),
+            disturb.measure(run.disturbance, run.modules, run.model.seed),
+        )
+        for run in batch
+    ]
+    variant = disturb.plant(first.disturbance, first.modules, first.model.seed)
+    flown = simulated("cable", first.modules, len(batch), **variant)
+    seals = {model: making.seal(folder, model) for model in models}
+    for run, pilot, flight in zip(batch, pilots, fly(robot, flown, pilots), strict=True):
+        if not np.isfinite(flight.configuration).all():
+            raise ModelError(f"{run.name}: the simulated robot flew apart; no number is made of this run")
+        keep(folder.run(run), identity(plan, run, seals[run.model]), flight, pilot.desired)
+
+
+def keep(path: Path, about: dict[str, Any], flight: Flight, desired: Array) -> None:
+    """Writes a run: configuration (K + 1, N, 3), actions (K, N, A), positions (K + 1, N, 3), m, directors
+    (K + 1, N, 3, 3), desired (K, N, 3), meta (JSON)."""
+    with written(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, meta=json.dumps(about, sort_keys=True), desired=desired, **flight._asdict())
+
+
+def read(path: Path) -> Kept:
+    """A run by its file; `ModelError` where there is none that can be read."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return Kept(Flight(*(file[name] for name in Flight._fields)), file["desired"])
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise ModelError(f"{path}: no run that can be read ({error}); delete it and fly again") from error
+
+
+def meta(path: Path) -> dict[str, Any] | None:
+    """What a run says of itself; None where there is none, or a damaged one, which is made again."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return json.loads(str(file["meta"]))
+    except (OSError, ValueError, KeyError, EOFError):
+        return None

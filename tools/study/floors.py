@@ -1,0 +1,55 @@
+"""The floor of every cell: the smallest error that any sequence of actions is known to reach, found on the plant."""
+
+from __future__ import annotations
+
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.study import flights, work
+from modsoft.study.folder import Folder
+from modsoft.study.plan import Plan
+from modsoft.training.evaluate import Flight
+from modsoft.training.fleet import simulated
+
+STEP_S = 0.35  # of one core, for a control step of four modules, about
+
+Array = NDArray[np.float64]
+
+
+def find_all(plan: Plan, folder: Folder, jobs: int) -> None:
+    """floors/*.npz, each a run like any other: what the robot does under the best actions found."""
+    missing = [each for each in plan.floors if flights.meta(folder.floor(*each)) != identity(plan, *each)]
+    work.spread("floors", partial(_find, plan, folder), missing, partial(find_s, plan), jobs)
+
+
+def find_s(plan: Plan, each: tuple[str, int]) -> float:
+    return (plan.steps or 250) * STEP_S * (each[1] / 4) ** 2
+
+
+def identity(plan: Plan, task: str, modules: int) -> dict[str, Any]:
+    steps = len(flights.desired_of(plan, task, modules))
+    return {"task": task, "modules": modules, "steps": steps, "seed": 0, "code_version": version("modsoft")}
+
+
+def _find(plan: Plan, folder: Folder, each: tuple[str, int], told: work.Told) -> None:
+    from modsoft.training.optimise import floor
+
+    task, modules = each
+    desired = flights.desired_of(plan, task, modules)
+    actions, _ = floor("cable", modules, desired, seed=0)
+    flights.keep(folder.floor(*each), identity(plan, *each), replay(modules, actions), desired)
+
+
+def replay(modules: int, actions: Array) -> Flight:
+    """What a robot at rest does under actions (K, N, A)."""
+    fleet = simulated("cable", modules, 1)
+    told = [(fleet.configuration[0], fleet.positions[0], fleet.directors[0])]
+    for action in actions:
+        fleet.step(action[None])
+        told.append((fleet.configuration[0], fleet.positions[0], fleet.directors[0]))
+    configuration, positions, directors = (np.stack(values) for values in zip(*told, strict=True))
+    return Flight(configuration, np.asarray(actions), positions, directors)

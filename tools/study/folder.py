@@ -1,0 +1,40 @@
+"""Where everything of a study lies: one folder, every file in it named by what it holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from modsoft.study.plan import Model, Run
+
+
+class Folder:
+    """OUT of the study. `make` creates what is missing of it."""
+
+    def __init__(self, out: Path):
+        self.out = out
+        self.results = out / "results.json"
+        self.report = out / "report.md"
+        self.notes = out / "notes.md"  # written by people; the report ends with it
+        self.figures = out / "figures"
+
+    def make(self) -> None:
+        for name in ("data", "models", "estimates", "runs", "floors", "figures"):
+            (self.out / name).mkdir(parents=True, exist_ok=True)
+
+    def data(self, name: str) -> Path:
+        return self.out / "data" / f"{name}.h5"
+
+    def checkpoint(self, model: Model) -> Path:
+        return self.out / "models" / f"{model.name}.pt"
+
+    def onnx(self, model: Model) -> Path:
+        return self.out / "models" / f"{model.name}.onnx"
+
+    def estimate(self, model: Model) -> Path:
+        return self.out / "estimates" / f"{model.name}.npz"
+
+    def run(self, run: Run) -> Path:
+        return self.out / "runs" / f"{run.name}.npz"
+
+    def floor(self, task: str, modules: int) -> Path:
+        return self.out / "floors" / f"{task}{modules}.npz"

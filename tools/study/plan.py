@@ -1,0 +1,133 @@
+"""What the study consists of: data, models, closed-loop runs, floors. Pure values; who makes them stands elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+TASKS = ("A", "B", "C")
+CORRECTIONS = ("none", "integral")
+SPLITS = ("blocks", "shuffled")
+# What the robot or its tracker suffers; `disturb.py` does it.
+DISTURBANCES = ("noise", "lost", "stiffness", "payload")
+MAIN = ("bilstm", "rich")  # network and data that the marks are set for
+
+
+@dataclass(frozen=True)
+class Data:
+    """A data set to collect."""
+
+    name: str
+    samples: int
+    strategy: str
+    seed: int
+    steps: int  # of an episode
+    robot: str = "cable-4"
+
+
+@dataclass(frozen=True)
+class Model:
+    """A network to train. data: the name of a mix of data sets, see `Plan.mixes`."""
+
+    network: str
+    data: str
+    split: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.network}-{self.data}-{self.split}-{self.seed}"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A model in closed loop on a robot of `modules` modules."""
+
+    model: Model
+    task: str
+    modules: int
+    correction: str
+    disturbance: str = "none"
+
+    @property
+    def name(self) -> str:
+        return f"{self.model.name}.{self.task}{self.modules}.{self.correction}.{self.disturbance}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """data: to collect; mixes: which of them a model is trained on, by the name that `Model.data` has."""
+
+    data: tuple[Data, ...]
+    mixes: dict[str, tuple[str, ...]]
+    models: tuple[Model, ...]
+    runs: tuple[Run, ...]
+    floors: tuple[tuple[str, int], ...]  # task, modules
+    settings: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)  # of training, by network and mix
+    steps: int | None = None  # of each task; all by default
+
+    @property
+    def seeds(self) -> list[int]:
+        return sorted({model.seed for model in self.models})
+
+
+def models(seeds: tuple[int, ...]) -> tuple[Model, ...]:
+    """All three networks on the paper's data in both splits; the biLSTM on the rich data, honestly split."""
+    wanted = [(network, "paper", split) for network in ("module-lstm", "lstm", "bilstm") for split in SPLITS]
+    wanted.append((*MAIN, "blocks"))
+    return tuple(Model(*each, seed) for each in wanted for seed in seeds)
+
+
+def runs(of: tuple[Model, ...], numbers: tuple[int, ...]) -> tuple[Run, ...]:
+    """Tables 2 and 3, the other module `numbers`, and the disturbances, by the models of the honest split."""
+    flown = [model for model in of if model.split == "blocks" and model.network != "module-lstm"]
+    wanted = []
+    for model in flown:
+        main = (model.network, model.data) == MAIN
+        modules = [4] + ([6] if model.network == "bilstm" else []) + (list(numbers) if main else [])
+        for correction in CORRECTIONS:
+            for task in TASKS:
+                wanted += [Run(model, task, each, correction) for each in modules]
+                if main:
+                    wanted += [Run(model, task, each, correction, what) for each in (4, 6) for what in DISTURBANCES]
+    return tuple(wanted)
+
+
+# As many samples as the paper's, collected its two ways.
+PAPER = Data("paper", samples=16_000, strategy="staged", seed=0, steps=1000)
+TRADITIONAL = Data("traditional", samples=16_000, strategy="random", seed=0, steps=1000)
+RICH = (Data("rich-staged", samples=96_000, strategy="staged", seed=1, steps=300),)
+
+
+def full() -> Plan:
+    """The study as it is reported."""
+    made = models(seeds=(0, 1, 2))
+    return Plan(
+        data=(PAPER, TRADITIONAL, *RICH),
+        mixes={"paper": (PAPER.name,), "rich": tuple(each.name for each in RICH)},
+        models=made,
+        runs=runs(made, numbers=(2, 3, 5, 8, 12)),
+        floors=tuple((task, modules) for modules in (4, 6) for task in TASKS),
+        settings={
+            ("module-lstm", "paper"): {"batch": 128, "iterations": 6000},
+            ("lstm", "paper"): {"batch": 128, "iterations": 9000},
+            ("bilstm", "paper"): {"batch": 128, "iterations": 9000},
+            ("bilstm", "rich"): {"batch": 256, "iterations": 20000},
+        },
+    )
+
+
+def quick() -> Plan:
+    """The same in miniature, to see that it works: its numbers say nothing."""
+    made = models(seeds=(0,))
+    sets = tuple(Data(each.name, 8 * 60, each.strategy, each.seed, steps=60) for each in (PAPER, TRADITIONAL, *RICH))
+    small = {"batch": 32, "iterations": 60, "layers": 2, "hidden": 16}
+    return Plan(
+        data=sets,
+        mixes={"paper": (PAPER.name,), "rich": tuple(each.name for each in RICH)},
+        models=made,
+        runs=runs(made, numbers=(3,)),
+        floors=(("A", 4),),
+        settings={(model.network, model.data): small for model in made},
+        steps=12,
+    )
