@@ -57,6 +57,12 @@ class PortBusy(ModsoftError):
     exit_code = 75
 
 
+class InUse(ModsoftError):
+    """Another process works on the same files."""
+
+    exit_code = 75
+
+
 class ProtocolMismatch(ModsoftError):
     """The board speaks another protocol, or is configured for other hardware than the robot file says."""
 

@@ -1,9 +1,14 @@
 """Who makes the episodes: processes of this machine, the jobs of a SLURM cluster, or dask's workers.
 
-A backend runs task(bundle) for every bundle, at most `jobs` at a time, and yields now and then, so that the caller can
-look what is there; its own files go to `folder`. It raises the task's own error, or `WorkerLost` where a worker died
-and its work was not taken over. What the workers make they store themselves: they share the folder of the data set,
-and the same installation.
+A backend proves its options first and gives a function that deals out work, for as long as its context is entered. That
+function runs task(bundle) for every bundle, at most `jobs` at a time, and yields now and then, so that the caller can
+look what is there; the backend's own files go to `folder`. It raises the task's own error, or `WorkerLost` where a
+worker died and its work was not taken over. What the workers make they store themselves: they share the folder of the
+data set, and the same installation.
+
+Tasks travel pickled, and whoever can change what travels runs code as the user: between processes of this machine
+through pipes, with dask through ports of this machine alone unless a cluster of several is asked for, with submitit
+through files in a folder whose name cannot be guessed.
 """
 
 from __future__ import annotations
@@ -11,11 +16,12 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import secrets
 import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +31,7 @@ from modsoft.training.workers import WorkerLost
 
 Bundle = list[int]
 Task = Callable[[Bundle], None]
+Deal = Callable[[Task, list[Bundle]], Iterator[Any]]
 Options = dict[str, Any]
 
 LOOK_S = 3.0  # pause between two looks at the queue of a cluster
@@ -33,15 +40,16 @@ SHOWN_S = 20.0  # until a network file system shows the result of a job that has
 ARRAY_PER_JOB, LONGEST_ARRAY = 4, 1000
 
 
-def by_processes(task: Task, bundles: list[Bundle], jobs: int, folder: Path, options: Options) -> Iterator[None]:
+@contextmanager
+def by_processes(jobs: int, folder: Path, options: Options) -> Iterator[Deal]:
     """Processes of this machine; jobs = 1: this process."""
     if options:
         raise UsageError(f"backend local takes no option, found {', '.join(options)}; see --backend")
-    for _ in workers.run(task, bundles, jobs):
-        yield
+    yield lambda task, bundles: workers.run(task, bundles, jobs)
 
 
-def by_submitit(task: Task, bundles: list[Bundle], jobs: int, folder: Path, options: Options) -> Iterator[None]:
+@contextmanager
+def by_submitit(jobs: int, folder: Path, options: Options) -> Iterator[Deal]:
     """One array of SLURM jobs through submitit. options: parameters of submitit's executor (slurm_partition,
     timeout_min, ...), or `cluster=local` to try it without SLURM."""
     submitit = _extra("submitit", "slurm")
@@ -49,13 +57,20 @@ def by_submitit(task: Task, bundles: list[Bundle], jobs: int, folder: Path, opti
     cluster = asked.pop("cluster", "slurm")
     if cluster == "slurm" and shutil.which("sbatch") is None:
         raise DeviceAbsent("no SLURM here: sbatch is not on the path; run on a login node, or use --backend local")
-    if not bundles:
-        return
-    executor = submitit.AutoExecutor(folder=folder / "jobs", cluster=cluster)
+    # submitit unpickles what it finds there: nothing that somebody put there before
+    executor = submitit.AutoExecutor(folder=folder / f"jobs-{secrets.token_hex(16)}", cluster=cluster)
     try:
         executor.update_parameters(**asked)
     except (NameError, TypeError, ValueError) as error:
-        raise UsageError(f"--backend-option: {' '.join(str(error).split())}") from error
+        raise _refused(error) from error
+    yield lambda task, bundles: _through_jobs(executor, cluster, task, bundles, jobs) if bundles else iter(())
+
+
+def _refused(error: Exception) -> UsageError:
+    return UsageError(f"--backend-option: {' '.join(str(error).split())}")
+
+
+def _through_jobs(executor: Any, cluster: str, task: Task, bundles: list[Bundle], jobs: int) -> Iterator[None]:
     share = -(-len(bundles) // min(len(bundles), ARRAY_PER_JOB * jobs, LONGEST_ARRAY))
     chunks = [bundles[i : i + share] for i in range(0, len(bundles), share)]
     left = executor.map_array(_Chunk(task), chunks)
@@ -138,13 +153,12 @@ def _not_queued(ids: list[str]) -> set[str]:
     return {each for each in ids if each not in queued}
 
 
-def by_dask(task: Task, bundles: list[Bundle], jobs: int, folder: Path, options: Options) -> Iterator[None]:
+@contextmanager
+def by_dask(jobs: int, folder: Path, options: Options) -> Iterator[Deal]:
     """dask's workers; work of one that dies goes to another. options: `scheduler=ADDRESS` of a cluster that runs, or
     `cluster=SLURMCluster` (or another class of dask-jobqueue) with that class's own parameters; neither: workers on
     this machine."""
     distributed = _extra("distributed", "dask")
-    if not bundles:
-        return
     address = options.get("scheduler")
     with ExitStack() as stack:
         try:
@@ -155,13 +169,19 @@ def by_dask(task: Task, bundles: list[Bundle], jobs: int, folder: Path, options:
                 client = distributed.Client(address, **{"timeout": 10, **others})
         except OSError as error:
             raise DeviceAbsent(f"no dask cluster at {address or 'hand'} ({error}); is it running?") from error
-        futures = stack.enter_context(client).map(task, bundles, pure=False)
-        for future in distributed.as_completed(futures):
-            try:
-                future.result()
-            except distributed.scheduler.KilledWorker as error:
-                raise WorkerLost("the same work killed several of dask's workers in a row (out of memory?)") from error
-            yield
+        except (ImportError, TypeError, ValueError) as error:
+            raise _refused(error) from error
+        stack.enter_context(client)
+        yield lambda task, bundles: _through_dask(distributed, client, task, bundles)
+
+
+def _through_dask(distributed: Any, client: Any, task: Task, bundles: list[Bundle]) -> Iterator[None]:
+    for future in distributed.as_completed(client.map(task, bundles, pure=False)):
+        try:
+            future.result()
+        except distributed.scheduler.KilledWorker as error:
+            raise WorkerLost("the same work killed several of dask's workers in a row (out of memory?)") from error
+        yield
 
 
 def _dask_cluster(distributed: Any, jobs: int, options: Options) -> Any:
@@ -173,7 +193,11 @@ def _dask_cluster(distributed: Any, jobs: int, options: Options) -> Any:
     jobqueue = _extra("dask_jobqueue", "dask")
     if not hasattr(jobqueue, name):
         raise UsageError(f"dask-jobqueue knows no cluster {name!r}; expected SLURMCluster, PBSCluster, ...")
-    cluster = getattr(jobqueue, name)(**options)
+    kind = getattr(jobqueue, name)
+    # Its workers come from other machines, whoever looks at its dashboard from this one.
+    set_up = importlib.import_module("dask").config.get(f"jobqueue.{kind.job_cls.config_name}.scheduler-options", {})
+    asked = {"dashboard_address": "127.0.0.1:0", **set_up, **options.pop("scheduler_options", {})}
+    cluster = kind(scheduler_options=asked, **options)
     cluster.scale(jobs=jobs)
     return cluster
 
@@ -185,7 +209,7 @@ def _extra(module: str, extra: str) -> Any:
         raise UsageError(f"this backend needs the extra {extra!r}: pip install 'modsoft[{extra}]' ({error})") from error
 
 
-BACKENDS: dict[str, Callable[[Task, list[Bundle], int, Path, Options], Iterator[None]]] = {
+BACKENDS: dict[str, Callable[[int, Path, Options], AbstractContextManager[Deal]]] = {
     "local": by_processes,
     "submitit": by_submitit,
     "dask": by_dask,

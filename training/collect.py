@@ -142,7 +142,7 @@ def collect(
 
     What `out` or `out.parts` holds already of the same recipe is kept; of another recipe it is refused. `progress` is
     told the samples done and the samples in all. plant: the fastest there is by default. backend, jobs, options: who
-    does the work, see `backends.BACKENDS`; none of them changes a number.
+    does the work, see `backends.BACKENDS`; none of them changes a number. `InUse` while another process collects it.
     """
     if plant is None:
         plant = plants.fastest(robot)
@@ -151,28 +151,31 @@ def collect(
     out = out.absolute()  # workers may stand in another folder
     shards = Shards(out.with_name(f"{out.name}.parts"))
     check_writable(out)
-    _sweep(out)
-    if out.exists():
-        header = _finished(out, recipe, count)
-        shards.remove()  # killed between the last two lines below
-        return header
-    shards.open(recipe)
-    shards.drop_damaged((steps + 1, robot.modules, 3))
-    wanted = set(range(count))
+    if out.exists() and not shards.folder.exists():
+        _sweep(out)
+        return _finished(out, recipe, count)
+    with BACKENDS[backend](jobs, shards.folder, options or {}) as deal, shards.held():
+        _sweep(out)
+        if out.exists():  # killed between the last two lines below, or another collection has just made it
+            header = _finished(out, recipe, count)
+            shards.remove()
+            return header
+        shards.open(recipe)
+        shards.drop_damaged((steps + 1, robot.modules, 3), (steps, robot.modules, robot.action_size))
+        wanted = set(range(count))
 
-    def tell() -> None:
-        progress(len(wanted & shards.finished()) * steps, count * steps)
+        def tell() -> None:
+            progress(len(wanted & shards.finished()) * steps, count * steps)
 
-    tell()
-    missing = sorted(wanted - shards.finished())
-    bundles = [missing[i : i + plant.together] for i in range(0, len(missing), plant.together)]
-    task = _Task(recipe, robot, shards, plant.simulate)
-    for _ in BACKENDS[backend](task, bundles, jobs, shards.folder, options or {}):
         tell()
+        missing = sorted(wanted - shards.finished())
+        bundles = [missing[i : i + plant.together] for i in range(0, len(missing), plant.together)]
+        for _ in deal(_Task(recipe, robot, shards, plant.simulate), bundles):
+            tell()
 
-    joined = (shards.read(index) for index in range(count))
-    header = dataset.join(out, recipe, stage_borders(strategy, robot.modules, steps), count, joined)
-    shards.remove()
+        joined = (shards.read(index) for index in range(count))
+        header = dataset.join(out, recipe, stage_borders(strategy, robot.modules, steps), count, joined)
+        shards.remove()
     return header
 
 

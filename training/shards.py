@@ -1,15 +1,20 @@
 """The folder of finished episodes beside an unfinished data set: all that a restarted collection goes on from.
 
-Every episode is one file, under its final name only when whole; any number of processes on any number of machines that
-share the folder may write to it. Two that make the same episode write the same numbers.
+Every episode is one file, under its final name only when whole; any number of workers on any number of machines that
+share the folder may write to it. Two that make the same episode write the same numbers. One collection at a time deals
+out the work, joins and clears away.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
+import re
 import shutil
 import socket
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +22,11 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from modsoft.runtime.errors import ModelError, OutputError
+from modsoft.runtime.errors import InUse, ModelError, OutputError
 from modsoft.runtime.files import written
 from modsoft.training.dataset import Episode
+
+EPISODE = re.compile(r"episode-([0-9]{6}|[1-9][0-9]{6,8})\.npz")
 
 
 @dataclass(frozen=True)
@@ -28,17 +35,52 @@ class Shards:
 
     folder: Path
 
-    def open(self, recipe: dict[str, Any]) -> None:
-        """Makes the folder, or checks that the one there belongs to the same recipe (`ModelError`)."""
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """The folder, made where it is not there, for this collection alone; `InUse` while another one has it. The
+        system lets go of it when the process ends, however it ends."""
+        while True:
+            self._make()
+            with open(self.folder / "lock", "wb", opener=_own) as lock:
+                self._lock(lock.fileno())
+                if self._is_there(lock.fileno()):
+                    yield
+                    return  # else another one was done with the folder meanwhile, and took it away
+
+    def _make(self) -> None:
+        if self.folder.is_symlink():  # it would be cleared away wherever it is
+            raise ModelError(f"{self.folder}: a link, expected a folder of modsoft-collect; choose another --out")
         try:
             self.folder.mkdir(exist_ok=True)
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be made ({error.strerror}); choose another --out") from error
+
+    def _lock(self, descriptor: int) -> None:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InUse(f"{self.folder}: another modsoft-collect works on it; wait for it, or stop it") from error
+        except OSError:
+            pass  # a file system without locks
+
+    def _is_there(self, descriptor: int) -> bool:
+        """Whether the open lock is the one in the folder."""
+        try:
+            return os.path.samestat(os.fstat(descriptor), os.stat(self.folder / "lock"))
+        except FileNotFoundError:
+            return False
+
+    def open(self, recipe: dict[str, Any]) -> None:
+        """Begins in the folder, or checks that what is there belongs to the same recipe (`ModelError`)."""
         for stale in self.folder.glob(".*.tmp"):  # of a process that was killed while it wrote
             stale.unlink(missing_ok=True)
         told = self.folder / "recipe.json"
         if told.is_file():
-            refuse_other(json.loads(told.read_text(encoding="utf-8")), recipe, self.folder)
+            try:
+                found = json.loads(told.read_text(encoding="utf-8"))
+            except (OSError, ValueError, RecursionError) as error:
+                raise ModelError(f"{told}: cannot be read ({error}); delete its folder to start anew") from error
+            refuse_other(found, recipe, self.folder)
             return
         with written(told) as temporary:
             temporary.write_text(json.dumps(recipe, indent=1), encoding="utf-8")
@@ -46,29 +88,37 @@ class Shards:
     def finished(self) -> set[int]:
         """Indices of the episodes that are there. The folder is listed rather than asked for single files, for a
         network file system would go on denying a file that it was asked for before another machine wrote it."""
-        names = os.listdir(self.folder)
-        return {int(name[8:-4]) for name in names if name.startswith("episode-") and name.endswith(".npz")}
+        return {int(found[1]) for name in os.listdir(self.folder) if (found := EPISODE.fullmatch(name))}
 
-    def drop_damaged(self, shape: tuple[int, ...]) -> None:
-        """Deletes episodes that cannot be read, are not finite, or whose configuration has another shape."""
+    def drop_damaged(self, configuration: tuple[int, ...], action: tuple[int, ...]) -> None:
+        """Deletes episodes that cannot be read, are not finite, or whose arrays have other shapes than these."""
         for index in self.finished():
             try:
                 episode = self.read(index)
-            except ModelError:
-                self.path(index).unlink()
-            else:
-                if episode.configuration.shape != shape or not episode.is_finite():
-                    self.path(index).unlink()
+                is_sound = (episode.configuration.shape, episode.action.shape) == (configuration, action)
+                is_sound = is_sound and episode.is_finite()
+            except (ModelError, TypeError):  # what numpy says to arrays of text
+                is_sound = False
+            if not is_sound:
+                self._drop(self.path(index))
+
+    def _drop(self, path: Path) -> None:
+        try:
+            path.unlink()
+        except OSError as error:
+            raise OutputError(f"{path}: no whole episode, and cannot be deleted ({error.strerror})") from error
 
     def path(self, index: int) -> Path:
         return self.folder / f"episode-{index:06}.npz"
 
     def read(self, index: int) -> Episode:
         path = self.path(index)
+        if path.is_symlink():
+            raise ModelError(f"{path}: a link, expected an episode; delete it")
         try:
             with np.load(path, allow_pickle=False) as file:
                 return Episode(file["configuration"], file["action"], int(file["redrawn"]))
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, BadZipFile) as error:
             raise ModelError(
                 f"{path}: no whole episode ({error}); every worker must share this folder, run again to make it"
             ) from error
@@ -85,8 +135,15 @@ class Shards:
             shutil.rmtree(trash, ignore_errors=True)
 
 
+def _own(path: str, flags: int) -> int:
+    """Opens a file of this folder; a link there might name any file of the user's."""
+    return os.open(path, flags & ~os.O_TRUNC | os.O_NOFOLLOW, 0o666)
+
+
 def refuse_other(found: dict[str, Any], recipe: dict[str, Any], where: Path) -> None:
     """`ModelError` that names the first difference of two recipes."""
+    if not isinstance(found, dict):
+        raise ModelError(f"{where}: begun with a recipe that is none; give another --out, or delete it")
     differences = [key for key in recipe if found.get(key) != recipe[key]]
     if differences:
         key = differences[0]

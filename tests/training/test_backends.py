@@ -124,7 +124,8 @@ def test_a_process_that_dies_is_told_and_gone_on_from(tmp_path, straight):
 
 
 def first(backend, options, tmp_path):
-    next(backends.BACKENDS[backend](lambda bundle: None, [[0]], 1, tmp_path, options))
+    with backends.BACKENDS[backend](1, tmp_path, options):
+        pass
 
 
 def test_local_takes_no_option(tmp_path):
@@ -181,7 +182,8 @@ def test_an_array_is_no_longer_than_slurm_takes(tmp_path, monkeypatch):
     for jobs, longest in ((2, 8), (600, 1000)):
         seen.clear()
         with pytest.raises(ModelError, match="seen"):
-            next(backends.by_submitit(lambda bundle: None, bundles, jobs, tmp_path, {"cluster": "local"}))
+            with backends.by_submitit(jobs, tmp_path, {"cluster": "local"}) as deal:
+                next(deal(lambda bundle: None, bundles))
         assert len(seen) <= longest
         assert [bundle for chunk in seen for bundle in chunk] == bundles
 
