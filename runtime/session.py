@@ -39,7 +39,7 @@ from modsoft.runtime.errors import (
     UsageError,
 )
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.ports import ports_here
+from modsoft.runtime.ports import find_port, ports_here
 from modsoft.runtime.protocol import VentMode
 from modsoft.runtime.rehearsal import Rehearsal
 from modsoft.runtime.robot import Robot
@@ -77,12 +77,12 @@ def run(options: Options) -> None:
     raises what ended it earlier."""
     said = time.perf_counter()
     robot, robot_text, beside = _robot(options)
-    port = options.port or robot.serial.port
+    port = ""
     if not options.dry_run:
         if robot.tracker.source == "replay":
             raise UsageError("recorded frames say nothing of where the robot is, so no valve is driven by them; "
                              "give --dry-run, or --tracker ndi")  # fmt: skip
-        _check_port(port)
+        port = _port(options.port or robot.serial.port)
     controller, digest = _model(options.model, robot)
     task = options.task or robot.loop.task
     desired = _task(task, robot)[: options.steps]
@@ -114,16 +114,16 @@ def run(options: Options) -> None:
         if board is not None and not options.yes:
             _ask()
         tally = Tally(robot, len(desired))
+        signals.hold()  # from here on there is a log to be closed
         log = logs.RunLog(options.runs, robot.name, robot_text, {
             "command": sys.argv[1:], "robot": robot.to_dict(), "task": task, "steps": len(desired),
             "correction": options.correction,
             "model": {"file": str(options.model), "sha256": digest, "description": _described(controller)},
             "board": None if board is None else board.hello._asdict(), "port": port or None,
         })  # fmt: skip
-        signals.hold()
-        exits.enter_context(keys)
         error: BaseException | None = None
         try:
+            exits.enter_context(keys)
             if board is not None:
                 board.arm(robot)
             judge = FrameJudge(robot)  # a new one: Enter may have been long in coming
@@ -141,11 +141,12 @@ def run(options: Options) -> None:
 
 def finish(board: Board | None, log: logs.RunLog, tally: Tally, slot: Slot, error: BaseException | None) -> None:
     """Vents, closes the log, says what came of the run, and raises what ended it, if anything did."""
-    began_ns = time.monotonic_ns()
+    began_ns, vented_ns = time.monotonic_ns(), None
     vented, pressed = False, dict[int, float]()
     if board is not None:
         try:
             vented = board.vent(VentMode.DUMP if isinstance(error, StopKey) else VentMode.RAMP)
+            vented_ns = time.monotonic_ns() if vented else None
             pressed = board.still_pressed() if vented else {}
         except Exception as failed:  # noqa: BLE001 - the log must still be closed; the board's own timer vents
             error = error or failed
@@ -163,7 +164,7 @@ def finish(board: Board | None, log: logs.RunLog, tally: Tally, slot: Slot, erro
         code = error.exit_code if isinstance(error, ModsoftError) else INTERNAL_EXIT_CODE
         reason = str(error) or type(error).__name__
     log.put({"event": "end", "mono_ns": began_ns, "exit_code": code, "reason": reason, "vented": vented,
-             "still_bar": pressed})  # fmt: skip
+             "vented_ns": vented_ns, "still_bar": pressed})  # fmt: skip
     figures = {"figures": tally.figures(), "tracker": dict(slot.counts), "vented": vented}
     log.close(code, reason, {**figures, "link": None if board is None else board.statistics})
     if board is None:
@@ -200,14 +201,13 @@ def _robot(options: Options) -> tuple[Robot, str, Path]:
     return robot, text, path.parent if path.is_file() else Path()
 
 
-def _check_port(port: str) -> None:
-    """Whether a port was told and is there, without opening it: that comes last."""
-    if not port:
+def _port(told: str) -> str:
+    """The board's port, which is there. It is not opened: that comes last."""
+    if not told:
         raise UsageError(
             f"the board's port is not told; give --port, or port under [serial] in the robot file; {ports_here()}"
         )
-    if os.name == "posix" and not Path(port).exists():
-        raise DeviceAbsent(f"no board at {port}: no such port; {ports_here()}")
+    return find_port(told)
 
 
 def _model(path: Path, robot: Robot) -> tuple[Controller, str]:

@@ -1,0 +1,135 @@
+"""modsoft-runtime as a process of its own on an emulated board and the fake tracker, for faults of host and tracker."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+from virtual_loop import planar_poses
+
+from modsoft.hil.emulator import EmulatedBoard, is_event
+from modsoft.hil.polaris import write_tool_files
+from modsoft.hil.rig import Child
+from modsoft.runtime import log as logs
+
+SCRIPT = Path(sys.executable).with_name("modsoft-runtime")
+FAULTY = (sys.executable, str(Path(__file__).with_name("faulty_runtime.py")))
+BEGIN_S = 30.0  # until the first tick, on a busy machine
+LEAVE_S = 15.0  # a lost board is listened to for 6 s
+
+
+class Stand:
+    """Context manager: a board, a tracker that sees a robot hanging still, and nothing that moves it.
+
+    Far cheaper than the rig, which simulates the robot: several of them run side by side.
+    """
+
+    def __init__(self, board="auto", angles_deg=(1.0, 2.0, -3.0)):
+        self.board = EmulatedBoard(board)
+        self._poses = planar_poses(angles_deg)
+        self._exits = contextlib.ExitStack()
+
+    def __enter__(self):
+        with self._exits as exits:
+            folder = Path(exits.enter_context(tempfile.TemporaryDirectory(prefix="modsoft-stand-")))
+            self.tracker_port = str(folder / "ttyPolaris")
+            self.tracker = Child("modsoft.hil.polaris", ["--link", self.tracker_port], lambda line: None)
+            exits.callback(self.tracker.stop)
+            self.tool_files = write_tool_files(folder, len(self._poses))
+            self.tracker.wait_ready()
+            self.tracker.send({"poses": self._poses.tolist()})
+            exits.enter_context(self.board)
+            self.board.send("sensors 20")
+            self._exits = exits.pop_all()
+        return self
+
+    def __exit__(self, *told):
+        self._exits.close()
+
+    def options(self):
+        """What modsoft-runtime has to be told to run on these."""
+        tools = [option for path in self.tool_files for option in ("--tool", str(path))]
+        return ["--yes", "--robot", "pneumatic-3", "--port", self.board.port, "--tracker-port", self.tracker_port, *tools]
+
+
+class Run:
+    """Context manager: modsoft-runtime on a stand, killed at the end if need be.
+
+    program: what is started; a wrapper of it such as `FAULTY` for faults in the process itself.
+    """
+
+    def __init__(self, stand, model, folder, *options, task="down", program=(str(SCRIPT),), **how):
+        self.stand, self.runs = stand, folder / "runs"
+        self.began = len(stand.board.trace)
+        command = [*program, *stand.options(), "--model", str(model), "--task", str(task), *options]
+        self.process = subprocess.Popen(
+            [*command, "--runs-dir", str(self.runs)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE, text=True, errors="replace", start_new_session=True, **how,
+        )  # fmt: skip
+        self.words = []  # (CLOCK_MONOTONIC ns, line)
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self):
+        for line in self.process.stderr:
+            self.words.append((time.monotonic_ns(), line.rstrip("\n")))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *told):
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.kill()
+        self.process.wait()
+        self._reader.join()
+        self.process.stderr.close()
+
+    @property
+    def said(self):
+        return "\n".join(line for _, line in self.words)
+
+    def wait_for(self, condition, timeout_s=BEGIN_S):
+        until_s = time.monotonic() + timeout_s
+        while not condition():
+            assert self.process.poll() is None, self.said
+            assert time.monotonic() < until_s, self.said
+            time.sleep(0.02)
+
+    def log_text(self):
+        return "".join(path.read_text() for path in self.runs.glob("*/run.jsonl"))
+
+    def armed(self):
+        """Whether the log is open, which is just before arming."""
+        return any(self.runs.glob("*/run.jsonl"))
+
+    def ticks(self):
+        return self.log_text().count('\n{"tick"')
+
+    def left(self):
+        """The exit code and when the process was seen to be gone, CLOCK_MONOTONIC ns; the stand then knows all that the
+        board did until its port was closed. Its events come some time after the process has ended."""
+        code, left_ns = self.process.wait(LEAVE_S), time.monotonic_ns()
+        self._reader.join()
+        self.stand.board.wait_for(is_event("uart-close"), 5.0, since=self.began)
+        return code, left_ns
+
+    def log(self):
+        [folder] = self.runs.iterdir()
+        return logs.read(folder)
+
+    def closed_ns(self):
+        """CLOCK_MONOTONIC (ns) at which the board closed the last valve, 0 where none was open; infinite while one
+        is."""
+        duties, closed_ns = {}, 0
+        for event in self.stand.board.trace[self.began :]:
+            if event["event"] == "pwm":
+                duties[event["channel"]] = event["duty"]
+                closed_ns = float("inf") if any(duties.values()) else event["mono_ns"]
+        return closed_ns
