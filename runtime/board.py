@@ -291,8 +291,9 @@ class Board:
             raise DeviceAbsent(f"board at {self.name}: {self._link.lost}")
         heard = self._link.counts["bytes"]
         what = f"{heard} bytes came that are not its language: wrong baud rate?" if heard else "not a byte came"
+        tried = f", {self._link.resets} resets included" if self._link.resets else ""
         raise DeviceAbsent(
-            f"nothing at {self.name} announced itself as our board, {RESETS} resets included ({what}); "
+            f"nothing at {self.name} announced itself as our board{tried} ({what}); "
             f"another port, or flash the firmware (make -C firmware flash PORT={self.name})"
         )
 

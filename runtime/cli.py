@@ -86,8 +86,8 @@ def _somebody_there() -> bool:
 
 @click.command("modsoft-runtime", context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
 @click.option("--port", default="", metavar="PORT",
-              help="Serial port of the board, such as /dev/ttyACM0 or COM3. [default: port under [serial] in the robot "
-                   "file]")  # fmt: skip
+              help="Serial port of the board, such as /dev/ttyACM0 or COM3, or its USB serial number as --list-ports "
+                   "says it. [default: port under [serial] in the robot file]")  # fmt: skip
 @click.option("--robot", default="robot.toml", show_default=True, metavar="FILE|NAME",
               help="Robot file, or a shipped robot.")  # fmt: skip
 @click.option("--model", default="model.onnx", show_default=True, metavar="FILE", type=click.Path(path_type=Path),

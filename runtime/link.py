@@ -41,6 +41,7 @@ HELLO_WAIT_S = 3.0  # then the board is reset through DTR
 RESETS = 3
 RESET_PULSE_S = 0.1
 RUNNING_AFTER_S = 1.5  # the bootloader's window is over by then: a STATUS means the firmware runs and can be asked
+STRANGER_AFTER_S = 2.5  # a second after that: our firmware would have said ten things
 STATUS_SILENCE_S = 0.35  # three at 10 Hz, and a little
 ACK_WAIT_S = 0.2  # twenty times the usual round trip
 MISSED_ACKS = 3
@@ -77,7 +78,8 @@ class Link:
         self.status_at = now
         self.lost: str | None = None  # why, in words
         self.lost_at = now
-        self.gave_up = False  # nothing announced itself, not even after all resets
+        self.gave_up = False  # nothing announced itself, not even after all resets; or something else talks there
+        self.resets = 0  # tried so far
         self.dtr = True  # what the port's DTR line should be; its rising edge resets the board
         self.ack_latency_s: float | None = None  # of the last SET, once it is acknowledged in time
         self.missed_acks = 0  # in a row
@@ -90,7 +92,7 @@ class Link:
 
         self._parser = Parser()
         self._asked_at = self._opened_at = now
-        self._resets = 0
+        self._late_bytes = 0  # that came when the firmware had to be running
         self._pulse_until: float | None = None
         self._heartbeat_due = now
         self._board_session = 0
@@ -156,6 +158,8 @@ class Link:
     def feed(self, data: bytes, now: float) -> None:
         """Take what came from the port."""
         self.counts["bytes"] += len(data)
+        if now - self._opened_at >= RUNNING_AFTER_S:
+            self._late_bytes += len(data)
         for frame in self._parser.feed(data):
             if isinstance(frame, ForeignHello):
                 self._on_foreign(frame.protocol_hash, now)
@@ -274,12 +278,16 @@ class Link:
             # It never restarted when the port was opened (some adapters do not), so its HELLO is long gone.
             self._opened_at = now  # asked again after the same time
             return encode(HelloReq(PROTOCOL_HASH))
-        if now - self._asked_at >= HELLO_WAIT_S:
-            if self._resets == RESETS:
+        if self._late_bytes and self.status is None and now - self._asked_at >= STRANGER_AFTER_S:
+            self.gave_up = True  # a device is there and runs something else: no reset makes it ours
+            self._lose("what talks there does not speak this protocol", now)
+        elif now - self._asked_at >= HELLO_WAIT_S:
+            if self.resets == RESETS:
                 self.gave_up = True
                 self._lose("nothing announced itself", now)
             else:
-                self._resets += 1
+                self.resets += 1
+                self._late_bytes = 0
                 self.dtr = False
                 self._pulse_until = now + RESET_PULSE_S
         return b""

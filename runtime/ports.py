@@ -1,15 +1,16 @@
-"""Serial ports: which are there, which is the board's, and opening one with a clear word when that fails."""
+"""Serial ports: which are there, which is the board's, finding it again by its USB identity, and opening it."""
 
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 from typing import NamedTuple
 
 import serial
 from serial.tools import list_ports as serial_list_ports
 
-from modsoft.runtime.errors import DeviceAbsent, PortBusy
+from modsoft.runtime.errors import DeviceAbsent, PortBusy, UsageError
 
 # Arduino MEGA 2560: Arduino's own identities, and the older and the Italian maker's numbers.
 MEGA_IDENTITIES = {(0x2341, 0x0042), (0x2341, 0x0010), (0x2341, 0x0242), (0x2A03, 0x0042), (0x2A03, 0x0010)}
@@ -36,7 +37,9 @@ class PortInfo(NamedTuple):
 
     def __str__(self) -> str:
         identity = f" {self.vid:04x}:{self.pid:04x}" if self.vid is not None and self.pid is not None else ""
-        return f"{self.name}{identity} {self.description}{' (Arduino MEGA 2560)' if self.is_mega else ''}"
+        serial_number = f", serial number {self.serial_number}" if self.serial_number else ""
+        mega = " (Arduino MEGA 2560)" if self.is_mega else ""
+        return f"{self.name}{identity} {self.description}{serial_number}{mega}"
 
 
 def list_ports() -> list[PortInfo]:
@@ -64,6 +67,33 @@ def ports_here() -> str:
     usb = [port for port in ports if port.vid is not None]
     names = [str(port) for port in usb or ports]
     return f"ports here: {'; '.join(names)}" if names else "there is no serial port on this machine: is it plugged in?"
+
+
+def find_port(told: str) -> str:
+    """The port to open for what a user told: the name of a port, or the USB serial number of the board, which finds it
+    under whatever name it has after it was plugged in again. Nothing is opened.
+
+    Raises `DeviceAbsent` when there is neither (names the MEGA that is there under another name), `UsageError` when
+    two boards have the same number.
+    """
+    if os.path.exists(told):
+        return told
+    found = list_ports()
+    fitting = [port.device for port in found if told in (port.serial_number, port.name, port.device)]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        raise UsageError(f"{told} is the serial number of {len(fitting)} devices; give one of {', '.join(fitting)}")
+    if os.name != "posix":
+        return told  # not every name that Windows takes is in its list
+    megas = [port for port in found if port.is_mega]
+    if len(megas) == 1 and megas[0].serial_number:
+        number = megas[0].serial_number
+        raise DeviceAbsent(
+            f"no board at {told}: no such port; there is an Arduino MEGA at {megas[0].name}, which "
+            f"--port {number} (its serial number) finds under any name"
+        )
+    raise DeviceAbsent(f"no board at {told}: no such port; {ports_here()}")
 
 
 def open_port(name: str, baud: int) -> serial.Serial:
