@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ import pytest
 from modsoft.runtime import protocol
 
 ROOT = Path(__file__).resolve().parents[2]
+BUILT = "MODSOFT_NATIVE_FIRMWARE"
 
 
 class NativeBoard:
@@ -128,8 +130,22 @@ class NativeBoard:
         return [self.library.controller_counts(self.handle, channel) for channel in range(protocol.CHANNELS)]
 
 
-def load(name: str) -> ctypes.CDLL:
-    library = ctypes.CDLL(str(ROOT / "build" / "firmware" / name))
+@pytest.fixture(scope="session")
+def native() -> Path:
+    """The folder with the firmware compiled for this machine: built now, or by whoever set the variable."""
+    if folder := os.environ.get(BUILT):
+        return Path(folder)
+    if shutil.which("gcc") is None or shutil.which("make") is None:
+        pytest.skip("no gcc or make here to compile the firmware natively")
+    done = subprocess.run(["make", "-C", str(ROOT / "firmware"), "native"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return ROOT / "build" / "firmware"
+
+
+@pytest.fixture(scope="session")
+def sanitised(native: Path) -> ctypes.CDLL:
+    """The firmware with the undefined-behaviour sanitiser, which ends the test run at the first finding."""
+    library = ctypes.CDLL(str(native / "libcontroller.so"))
     library.board_new.restype = ctypes.c_void_p
     for function in (library.board_faults, library.controller_counts, library.board_rx_bad):
         function.restype = ctypes.c_uint16
@@ -139,26 +155,6 @@ def load(name: str) -> ctypes.CDLL:
         function.restype = ctypes.c_uint8
     library.frame_crc32.restype = ctypes.c_uint32
     return library
-
-
-@pytest.fixture(scope="session")
-def build_native() -> None:
-    if shutil.which("gcc") is None or shutil.which("make") is None:
-        pytest.skip("no gcc or make here to compile the firmware natively")
-    done = subprocess.run(["make", "-C", str(ROOT / "firmware"), "native"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.fixture(scope="session")
-def sanitised(build_native: None) -> ctypes.CDLL:
-    """The firmware with the undefined-behaviour sanitiser, which ends the test run at the first finding."""
-    return load("libcontroller.so")
-
-
-@pytest.fixture(scope="session")
-def fast(build_native: None) -> ctypes.CDLL:
-    """The same without it, for long fuzzing."""
-    return load("libcontroller-fast.so")
 
 
 @pytest.fixture
