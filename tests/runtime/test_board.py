@@ -11,7 +11,7 @@ import serial
 from modsoft.runtime import ports, protocol
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board import Board
-from modsoft.runtime.errors import DeviceAbsent, LostInRun, PortBusy, Tripped
+from modsoft.runtime.errors import DeviceAbsent, LostInRun, PortBusy, Tripped, UsageError
 from modsoft.runtime.protocol import CHANNELS, PROTOCOL_HASH, Hello, State, Status
 
 HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 30000, 20000, 300, 1000)
@@ -185,6 +185,36 @@ def test_ports_are_listed_megas_first_and_by_their_lasting_name(monkeypatch, tmp
     assert (adapter.name, adapter.is_mega) == (str(devices[1]), False)
     assert plain.name == str(devices[0])
     assert "0403:6001" in str(adapter)
+
+
+def mega(device, serial_number):
+    return ports.PortInfo(device, device, "Arduino", 0x2341, 0x0042, serial_number)
+
+
+def test_port_is_found_by_its_name_or_by_the_serial_number_of_the_board(monkeypatch, tmp_path):
+    here = tmp_path / "ttyACM1"
+    here.touch()
+    monkeypatch.setattr(ports, "list_ports", lambda: [mega(str(here), "75A"), mega("/dev/ttyACM7", "75B")])
+    assert ports.find_port(str(here)) == str(here)
+    assert ports.find_port("75A") == str(here)
+    assert ports.find_port("75B") == "/dev/ttyACM7"
+    with pytest.raises(DeviceAbsent, match=r"no board at 75: no such port; ports here: .*75A.*75B"):
+        ports.find_port("75")
+
+
+def test_missing_port_names_the_mega_that_is_elsewhere_and_how_to_find_it(monkeypatch):
+    monkeypatch.setattr(ports, "list_ports", lambda: [mega("/dev/ttyACM1", "75A")])
+    with pytest.raises(DeviceAbsent, match=r"no board at /dev/ttyACM0: .* MEGA at /dev/ttyACM1, .*--port 75A"):
+        ports.find_port("/dev/ttyACM0")
+    monkeypatch.setattr(ports, "list_ports", lambda: [mega("/dev/ttyACM1", None)])  # some have no number
+    with pytest.raises(DeviceAbsent, match=r"ports here: /dev/ttyACM1 2341:0042"):
+        ports.find_port("/dev/ttyACM0")
+
+
+def test_a_serial_number_that_two_boards_have_is_no_identity(monkeypatch):
+    monkeypatch.setattr(ports, "list_ports", lambda: [mega("/dev/ttyACM0", "0001"), mega("/dev/ttyACM1", "0001")])
+    with pytest.raises(UsageError, match="give one of /dev/ttyACM0, /dev/ttyACM1"):
+        ports.find_port("0001")
 
 
 def test_no_port_at_all(monkeypatch):

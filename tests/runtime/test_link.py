@@ -68,3 +68,32 @@ def test_another_session_is_not_the_one_asked_for():
     link.feed(encode(IDLE._replace(state=State.ARMED), session=9), 0.21)
     assert not link.armed
     assert link.busy
+
+
+def test_what_talks_another_language_is_given_up_without_a_reset():
+    link = Link(0.0)
+    for tenth in range(1, 25):
+        link.feed(b"ready > ", 0.1 * tenth)
+        assert link.poll(0.1 * tenth) == b""
+        assert link.phase is Phase.WAITING
+    link.feed(b"ready > ", 2.5)
+    link.poll(2.5)
+    assert (link.phase, link.gave_up, link.resets) == (Phase.LOST, True, 0)
+
+
+def test_what_came_before_the_firmware_could_run_says_nothing():
+    """Half a frame from before the reset, then silence: our board, whose announcement was lost."""
+    link = Link(0.0)
+    link.feed(encode(IDLE)[20:], 0.01)
+    link.poll(2.5)
+    assert link.phase is Phase.WAITING
+    link.poll(3.0)
+    assert (link.phase, link.resets, link.dtr) == (Phase.WAITING, 1, False)
+
+
+def test_a_board_that_was_running_is_ours_whatever_else_came():
+    link = Link(0.0)
+    link.feed(b"noise", 1.6)
+    link.feed(encode(IDLE), 1.7)
+    link.poll(2.5)
+    assert link.phase is Phase.WAITING
