@@ -1,0 +1,73 @@
+"""Rows 1 to 4 of the failure matrix: frames that noise has changed, and frames that were good once."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TEN_TO_THE_8 = 100_000_000
+pytestmark = pytest.mark.timeout(4 * 3600)  # the full numbers take their time
+
+
+@pytest.fixture(scope="session")
+def corrupt():
+    """corrupt(kind, tries): the program tools/fuzz/corrupt.c, the firmware's logic on this machine; what it found."""
+    if shutil.which("gcc") is None or shutil.which("make") is None:
+        pytest.skip("no gcc or make here to compile the firmware natively")
+    subprocess.run(["make", "-s", "-C", str(ROOT / "firmware"), "native"], check=True)
+
+    def run(kind, tries):
+        command = [str(ROOT / "build" / "firmware" / "corrupt"), kind, str(tries)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.stdout, done.stderr
+        return json.loads(done.stdout)
+
+    return run
+
+
+def tell(matrix_row, row, fault, found):
+    """The line of a native row, and its judgement."""
+    applied = "applied" if row == 4 else "wrong applied"
+    matrix_row(
+        row,
+        fault=f"{fault}, native",
+        tries=found["tries"],
+        limit=f"0 {applied}, next good frame accepted",
+        worst=f"{found['wrong']} {applied}, {found['lost']} good ones lost",
+    )
+    assert (found["wrong"], found["lost"]) == (0, 0)
+
+
+def test_row_01_flipped_bits(corrupt, matrix_row, full):
+    tell(matrix_row, 1, "bit flips", corrupt("flip", TEN_TO_THE_8 if full else 10_000_000))
+
+
+@pytest.mark.parametrize(("kind", "fault"), [("drop", "dropped bytes"), ("insert", "inserted bytes")])
+def test_row_02_dropped_and_inserted_bytes(corrupt, matrix_row, full, kind, fault):
+    tell(matrix_row, 2, fault, corrupt(kind, TEN_TO_THE_8 if full else 1_000_000))
+
+
+def test_row_03_truncated_frames(corrupt, matrix_row, full):
+    found = corrupt("truncate", TEN_TO_THE_8 if full else 1_000_000)
+    tell(matrix_row, 3, "truncated frame", found)
+    matrix_row(
+        3,
+        fault="silence inside a frame, native",
+        tries=found["silences"],
+        limit="link timer fires: vented in 670 ms",
+        worst=f"{found['latest_vent_ms']} ms",
+        clock="virtual",
+    )
+    assert found["silences"] == found["tries"] // 1000
+    assert 300 < found["latest_vent_ms"] <= 670
+
+
+def test_row_03_garbage_frames(corrupt, matrix_row, full):
+    tell(matrix_row, 3, "garbage as long as a frame", corrupt("garbage", TEN_TO_THE_8 if full else 1_000_000))
+
+
+def test_row_04_duplicated_reordered_replayed(corrupt, matrix_row, full):
+    tell(matrix_row, 4, "duplicated, reordered, replayed", corrupt("repeat", TEN_TO_THE_8 if full else 100_000))
