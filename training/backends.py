@@ -58,15 +58,16 @@ def by_submitit(jobs: int, folder: Path, options: Options) -> Iterator[Deal]:
     if cluster == "slurm" and shutil.which("sbatch") is None:
         raise DeviceAbsent("no SLURM here: sbatch is not on the path; run on a login node, or use --backend local")
     # submitit unpickles what it finds there: nothing that somebody put there before
-    executor = submitit.AutoExecutor(folder=folder / f"jobs-{secrets.token_hex(16)}", cluster=cluster)
+    unknown = folder / f"jobs-{secrets.token_hex(16)}"
     try:
+        executor = submitit.AutoExecutor(folder=unknown, cluster=cluster)
         executor.update_parameters(**asked)
     except (NameError, TypeError, ValueError) as error:
         raise _refused(error) from error
     yield lambda task, bundles: _through_jobs(executor, cluster, task, bundles, jobs) if bundles else iter(())
 
 
-def _refused(error: Exception) -> UsageError:
+def _refused(error: BaseException) -> UsageError:
     return UsageError(f"--backend-option: {' '.join(str(error).split())}")
 
 
@@ -169,8 +170,8 @@ def by_dask(jobs: int, folder: Path, options: Options) -> Iterator[Deal]:
                 client = distributed.Client(address, **{"timeout": 10, **others})
         except OSError as error:
             raise DeviceAbsent(f"no dask cluster at {address or 'hand'} ({error}); is it running?") from error
-        except (ImportError, TypeError, ValueError) as error:
-            raise _refused(error) from error
+        except (ImportError, TypeError, ValueError, RuntimeError) as error:
+            raise _refused(error.__cause__ or error) from error  # a worker that does not start says why in the cause
         stack.enter_context(client)
         yield lambda task, bundles: _through_dask(distributed, client, task, bundles)
 

@@ -17,7 +17,7 @@ import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -40,18 +40,19 @@ class Shards:
         """The folder, made where it is not there, for this collection alone; `InUse` while another one has it. The
         system lets go of it when the process ends, however it ends."""
         while True:
-            self._make()
-            with open(self.folder / "lock", "wb", opener=_own) as lock:
+            with self._opened_lock() as lock:
                 self._lock(lock.fileno())
                 if self._is_there(lock.fileno()):
                     yield
                     return  # else another one was done with the folder meanwhile, and took it away
 
-    def _make(self) -> None:
-        if self.folder.is_symlink():  # it would be cleared away wherever it is
-            raise ModelError(f"{self.folder}: a link, expected a folder of modsoft-collect; choose another --out")
+    def _opened_lock(self) -> IO[bytes]:
+        for path in (self.folder, self.folder / "lock"):
+            if path.is_symlink():  # it would be cleared away, or written to, wherever it is
+                raise ModelError(f"{path}: a link, expected what modsoft-collect makes; choose another --out")
         try:
             self.folder.mkdir(exist_ok=True)
+            return open(self.folder / "lock", "wb", opener=_own)
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be made ({error.strerror}); choose another --out") from error
 
@@ -136,7 +137,7 @@ class Shards:
 
 
 def _own(path: str, flags: int) -> int:
-    """Opens a file of this folder; a link there might name any file of the user's."""
+    """Opens a file, but no link, which might name any file of the user's."""
     return os.open(path, flags & ~os.O_TRUNC | os.O_NOFOLLOW, 0o666)
 
 

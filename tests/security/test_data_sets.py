@@ -1,0 +1,94 @@
+"""A data set from a stranger reads nothing but itself, and is refused in one line."""
+
+import h5py
+import numpy as np
+import pytest
+
+from modsoft.runtime import robot as robots
+from modsoft.training import dataset
+
+
+@pytest.fixture
+def data_file(tmp_path):
+    """A small data set that is sound so far."""
+    robot = robots.load("pneumatic-2")
+    recipe = {"robot": robot.to_dict(), "strategy": "random", "steps": 3}
+    configuration = np.tile([0.0, 0.0, 1.0], (2, 4, 2, 1))
+    path = tmp_path / "data.h5"
+    dataset.write(dataset.DataSet(recipe, configuration, np.zeros((2, 3, 2, 1)), np.array([0, 3]), 0), path)
+    dataset.read(path)
+    return path
+
+
+def other_file(folder):
+    """A file of the victim's that holds sound numbers, for two modules."""
+    (folder / "private").write_bytes(np.zeros((2, 3, 2, 1)).tobytes())
+    with h5py.File(folder / "private.h5", "w") as file:
+        file["action"] = np.zeros((2, 3, 2, 1))
+    return folder
+
+
+def linked(file, folder):
+    file["action"] = h5py.ExternalLink(str(folder / "private.h5"), "/action")
+
+
+def soft_linked(file, folder):
+    file["elsewhere"] = h5py.ExternalLink(str(folder / "private.h5"), "/action")
+    file["action"] = h5py.SoftLink("/elsewhere")
+
+
+def stored_elsewhere(file, folder):
+    file.create_dataset("action", (2, 3, 2, 1), np.float64, external=[(str(folder / "private"), 0, h5py.h5f.UNLIMITED)])
+
+
+def virtual(file, folder):
+    layout = h5py.VirtualLayout((2, 3, 2, 1), np.float64)
+    layout[:] = h5py.VirtualSource(str(folder / "private.h5"), "action", (2, 3, 2, 1))
+    file.create_virtual_dataset("action", layout)
+
+
+def objects(file, folder):
+    file.create_dataset("action", (2, 3, 2, 1), h5py.string_dtype())
+
+
+def huge(file, folder):
+    file.create_dataset("action", (2, 10**12, 2, 1), np.float64)
+
+
+def compressed(file, folder):
+    file.create_dataset("action", data=np.zeros((2, 10**6, 2, 1)), compression="gzip")
+
+
+def a_group(file, folder):
+    file.create_group("action")
+
+
+@pytest.mark.parametrize(
+    ("attack", "says"),
+    [
+        (linked, "action is a link"),
+        (soft_linked, "action is a link"),
+        (stored_elsewhere, "action lies in other files"),
+        (virtual, "action lies in other files"),
+        (objects, "action is no array of floats"),
+        (a_group, "action is no array of floats"),
+        (huge, "action claims 32000000000000 bytes, the file holds 0"),
+        (compressed, "action claims 32000000 bytes"),
+    ],
+)
+def test_a_data_set_that_points_elsewhere_or_claims_too_much(tmp_path, data_file, attack, says, refused):
+    folder = other_file(tmp_path)
+    with h5py.File(data_file, "r+") as file:
+        del file["action"]
+        attack(file, folder)
+        if attack in (linked, soft_linked, stored_elsewhere, virtual):
+            assert file["action"][()].shape == (2, 3, 2, 1), "whoever does not look follows it"
+    refused(dataset.read, data_file, says)
+    refused(dataset.read_header, data_file, says)
+
+
+@pytest.mark.parametrize("recipe", ["", "[]", "{}", '{"robot": 1}', '{"robot": {}}', "[" * 10**5, "null"])
+def test_a_data_set_that_does_not_say_what_it_is_of(data_file, recipe, refused):
+    with h5py.File(data_file, "r+") as file:
+        file.attrs["recipe"] = recipe
+    refused(dataset.read, data_file)

@@ -1,0 +1,172 @@
+"""The folder of an unfinished collection, when a stranger had it: what is odd in it is made again, what reaches out of
+it is refused, and nothing outside it changes."""
+
+import json
+import pickle
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.errors import InUse
+from modsoft.training import collect, dataset
+from modsoft.training.plants import Plant
+from modsoft.training.shards import Shards
+
+ROBOT = robots.load("pneumatic-2")
+
+
+def still(robot, actions):
+    return from_angles_deg(np.zeros((len(actions), actions.shape[1] + 1, robot.modules)))
+
+
+def collected(out):
+    return collect.collect(ROBOT, out, 20, "random", 0, 10, plant=Plant("still", still, 1))
+
+
+@pytest.fixture
+def parts(tmp_path):
+    """The folder as a collection begins it."""
+    folder = tmp_path / "d.h5.parts"
+    folder.mkdir()
+    recipe = collect.recipe_of(ROBOT, "random", 0, 10, "still")
+    (folder / "recipe.json").write_text(json.dumps(recipe))
+    return folder
+
+
+@pytest.fixture
+def private(tmp_path):
+    """A file of the victim's."""
+    path = tmp_path / "private"
+    path.write_text("mine")
+    return path
+
+
+def claims_too_much(path):
+    header = b"\x93NUMPY\x01\x00" + (118).to_bytes(2, "little")
+    header += b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,)}".ljust(117) + b"\n"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("configuration", "action", "redrawn"):
+            archive.writestr(f"{name}.npy", header)
+
+
+def text(path):
+    np.savez(path, configuration=np.full((11, 2, 3), "x"), action=np.full((10, 2, 1), "x"), redrawn=0)
+
+
+def other_action(path):
+    np.savez(path, configuration=still(ROBOT, np.zeros((1, 10, 2, 1)))[0], action=np.zeros((10, 3, 1)), redrawn=0)
+
+
+@pytest.mark.parametrize("attack", [claims_too_much, text, other_action, Path.touch])
+def test_an_odd_episode_is_made_again(tmp_path, parts, attack):
+    attack(parts / "episode-000001.npz")
+    assert collected(tmp_path / "d.h5").samples == 20
+    assert dataset.read(tmp_path / "d.h5").samples == 20
+
+
+def test_a_pickle_among_the_episodes_is_not_run(tmp_path, parts, mark, evil):
+    np.savez(parts / "episode-000000.npz", configuration=np.array([evil]), action=np.zeros((10, 2, 1)), redrawn=0)
+    (parts / "jobs").mkdir()
+    (parts / "jobs" / "1_0_result.pkl").write_bytes(pickle.dumps(("success", evil)))
+    collected(tmp_path / "d.h5")
+    assert not mark.exists()
+
+
+def test_links_are_not_followed(tmp_path, parts, private, refused):
+    for name in ("episode-000000.npz", "lock", ".episode-000000.npz.here.1.tmp"):
+        (parts / name).symlink_to(private)
+    refused(collected, tmp_path / "d.h5", "lock: a link")
+    (parts / "lock").unlink()
+    collected(tmp_path / "d.h5")
+    assert private.read_text() == "mine"
+
+
+def test_a_folder_that_is_a_link_is_refused(tmp_path, refused):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / ".mine.tmp").touch()
+    (tmp_path / "d.h5.parts").symlink_to(tmp_path / "elsewhere")
+    refused(collected, tmp_path / "d.h5", "d.h5.parts: a link")
+    assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == [".mine.tmp"]
+
+
+@pytest.mark.parametrize(
+    "name", ["episode-.npz", "episode-x.npz", "episode--00001.npz", "episode-0000000.npz", "episode-٠٠٠٠٠٠.npz", "..."]
+)
+def test_other_names_are_left_alone(tmp_path, parts, name):
+    (parts / name).touch()
+    assert Shards(parts).finished() == set()
+    collected(tmp_path / "d.h5")
+
+
+@pytest.mark.parametrize("recipe", ["", "[]", "[" * 10**5, "null", '"x"', "\xff"])
+def test_a_recipe_that_is_none(tmp_path, parts, recipe, refused):
+    (parts / "recipe.json").write_text(recipe, encoding="latin-1")
+    refused(collected, tmp_path / "d.h5", "recipe")
+
+
+# ---- Two at a time --------------------------------------------------------------------------------------------------
+
+HOLDS = """
+import sys
+from pathlib import Path
+from modsoft.training.shards import Shards
+with Shards(Path(sys.argv[1])).held():
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_two_collections_do_not_work_on_the_same_data_set(tmp_path, parts):
+    command = [sys.executable, "-c", HOLDS, str(parts)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(InUse, match=r"d\.h5\.parts: another modsoft-collect works on it") as told:
+            collected(tmp_path / "d.h5")
+        assert told.value.exit_code == 75
+        other.kill()  # nothing of a killed one is in the way
+    assert collected(tmp_path / "d.h5").samples == 20
+
+
+def test_a_folder_that_another_collection_took_away_meanwhile_is_made_anew(tmp_path, parts, monkeypatch):
+    shards, taken = Shards(parts), []
+    lock = Shards._lock
+
+    def too_late(self, descriptor):
+        if not taken:
+            taken.append(shards.remove())
+        lock(self, descriptor)
+
+    monkeypatch.setattr(Shards, "_lock", too_late)
+    with shards.held():
+        assert [path.name for path in parts.iterdir()] == ["lock"]
+        with pytest.raises(InUse), Shards(parts).held():
+            pass
+
+
+@pytest.mark.parametrize(
+    ("backend", "option"),
+    [
+        ("local", "a=1"),
+        ("submitit", "cluster=nothing"),
+        ("submitit", "a=1"),
+        ("dask", "cluster=N"),
+        ("dask", "a=1"),
+        ("dask", "cluster=SLURMCluster"),
+        ("dask", "security=true"),
+    ],
+)
+def test_a_wrong_order_makes_nothing_and_shows_no_bar(tmp_path, backend, option):
+    pytest.importorskip({"local": "numpy", "submitit": "submitit", "dask": "dask_jobqueue"}[backend])
+    found = subprocess.run(
+        [sys.executable, "-m", "modsoft.training.collect_cli", "--robot", "pneumatic-2", "--out", "d.h5",
+         "--backend", backend, "--backend-option", option],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (found.returncode in (2, 69), len(found.stderr.splitlines())) == (True, 1), found.stderr
+    assert not list(tmp_path.iterdir())

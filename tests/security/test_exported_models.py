@@ -1,0 +1,90 @@
+"""An ONNX model from a stranger reads nothing but itself, and is refused in one line."""
+
+import os
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from onnx import TensorProto, helper
+
+from modsoft.runtime import artefact
+from modsoft.runtime.controller import Controller
+
+
+def resealed(model):
+    """Bytes of a changed model whose seal holds: it finds damage, it does not prove who made a file."""
+    (entry,) = (entry for entry in model.metadata_props if entry.key == artefact.METADATA_KEY)
+    seal = artefact._SEAL.search(entry.value.encode())[1].decode()
+    entry.value = entry.value.replace(seal, artefact.UNSEALED)
+    return artefact.sealed(model.SerializeToString())
+
+
+def largest_weight(model):
+    return max(model.graph.initializer, key=lambda tensor: len(tensor.raw_data))
+
+
+def outside(tensor, location):
+    """Puts the tensor's numbers into the file `location`, where the harm of reading it is that the model works."""
+    with open(os.path.basename(location), "wb") as file:
+        file.write(tensor.raw_data)
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    for key, value in (("location", location), ("offset", "0")):
+        tensor.external_data.add(key=key, value=value)
+
+
+def in_a_branch(model):
+    """Moves the largest weight into both branches of an If, and gives it there: onnxruntime reads files for these with
+    no word of where they may be."""
+    weight, graph = largest_weight(model), model.graph
+    inner = TensorProto()
+    inner.CopyFrom(weight)
+    inner.name = "inner"
+    out = helper.make_tensor_value_info("given", TensorProto.FLOAT, list(weight.dims))
+    branch = helper.make_graph([helper.make_node("Identity", ["inner"], ["given"])], "branch", [], [out], [inner])
+    node = helper.make_node("If", ["always"], [weight.name], then_branch=branch, else_branch=branch)
+    graph.initializer.remove(weight)
+    graph.initializer.append(helper.make_tensor("always", TensorProto.BOOL, [], [True]))
+    nodes = [node, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+    return [attribute.g.initializer[0] for attribute in graph.node[0].attribute]
+
+
+@pytest.mark.parametrize("place", ["initializer", "branch"])
+@pytest.mark.parametrize("location", ["weights.bin", "./weights.bin", "{folder}/weights.bin", "../{name}/weights.bin"])
+def test_a_model_with_weights_in_another_file(tmp_path, monkeypatch, model_file, place, location, refused):
+    monkeypatch.chdir(tmp_path)
+    model, path = onnx.load(model_file), tmp_path / "model.onnx"
+    tensors = in_a_branch(model) if place == "branch" else [largest_weight(model)]
+    path.write_bytes(resealed(model))
+    Controller.load(path)  # so far it is only an odd model
+    for tensor in tensors:
+        outside(tensor, location.format(folder=tmp_path, name=tmp_path.name))
+    path.write_bytes(resealed(model))
+    refused(Controller.load, path, "onnxruntime .* refuses it")
+
+
+def test_a_model_with_weights_at_an_address_of_the_memory(tmp_path, monkeypatch, model_file, refused):
+    monkeypatch.chdir(tmp_path)
+    model, path = onnx.load(model_file), tmp_path / "model.onnx"
+    tensor = largest_weight(model)
+    numbers = np.frombuffer(tensor.raw_data, dtype=np.uint8).copy()
+    outside(tensor, "weights.bin")
+    tensor.external_data[0].value, tensor.external_data[1].value = "*/_ORT_MEM_ADDR_/*", str(numbers.ctypes.data)
+    path.write_bytes(resealed(model))
+    refused(Controller.load, path, "onnxruntime .* refuses it")
+
+
+def test_a_model_in_the_other_format_of_onnxruntime(tmp_path, model_file, refused):
+    options, path = onnxruntime.SessionOptions(), tmp_path / "model.ort"
+    options.optimized_model_filepath = str(path)
+    options.add_session_config_entry("session.save_model_format", "ORT")
+    options.log_severity_level = 4
+    onnxruntime.InferenceSession(model_file, options)
+    content = path.read_bytes()
+    onnxruntime.InferenceSession(content)  # whoever does not say which format takes both
+    seal = artefact._SEAL.search(content)[1]
+    path.write_bytes(artefact.sealed(content.replace(seal, artefact.UNSEALED.encode())))
+    refused(Controller.load, path, "onnxruntime .* refuses it")
