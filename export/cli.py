@@ -21,7 +21,8 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
     """Export the trained network MODEL (model.pt of modsoft-train) to ONNX, for modsoft-runtime.
 
     The file holds one module's unit, which serves robots of any number of modules. It is compared with torch for 2 to
-    8, 16 and 64 modules before it gets its name; when any check fails nothing is written and the exit code is 65.
+    8, 16 and 64 modules before it gets its name; when any check fails nothing is written and the exit code is 65. (The
+    networks lstm and module-lstm are bound to their number of modules and compared for that.)
 
     \b
     Examples:
@@ -50,7 +51,8 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
     report, said = exported.report, exported.description
     click.echo(f"{exported.path}: {exported.path.stat().st_size / 1e6:.1f} MB, seal {said.file_sha256}")
     modules = ", ".join(map(str, said.modules_trained_on))
-    click.echo(f"for {said.kind} robots at {1.0 / said.period_s:g} Hz, trained on {modules} modules")
+    bound = "" if said.network.modules is None else " and bound to them"
+    click.echo(f"for {said.kind} robots at {1.0 / said.period_s:g} Hz, trained on {modules} modules{bound}")
     click.echo(
         f"largest difference from torch, share of the output range (at most {report.bound:.1e}; "
         f"torch's own in float32 {report.torch_error:.1e}):"
@@ -61,8 +63,10 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
         ("chain", report.chain),
         ("sweep short", report.one_sweep_fewer),
     ):
-        click.echo(f"  {name:<12}" + "".join(f"{error:>10.1e}" for error in errors.values()))
-    click.echo("  (sweep short: the chain with one sweep left out: it has to be far off for the check to count)")
+        if errors:
+            click.echo(f"  {name:<12}" + "".join(f"{error:>10.1e}" for error in errors.values()))
+    if report.one_sweep_fewer:
+        click.echo("  (sweep short: the chain with one sweep left out: it has to be far off for the check to count)")
 
 
 main = entry(cli)

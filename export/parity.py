@@ -17,15 +17,14 @@ import torch
 from numpy.typing import NDArray
 
 from modsoft.export import graph
-from modsoft.runtime.artefact import ACTUATION, FEATURES, FROM_NEIGHBOURS, IR_VERSION, OPSET, TO_NEIGHBOURS
+from modsoft.export.nodes import Weights
+from modsoft.runtime.artefact import FEATURES, FROM_NEIGHBOURS, IR_VERSION, OPSET, Network
 from modsoft.runtime.configuration import labels
-from modsoft.runtime.controller import Unit
+from modsoft.runtime.controller import BoundUnit, Unit, unit_of
 from modsoft.runtime.errors import ModelError
-from modsoft.training.networks import BiLSTM
 
-MODULES = (2, 3, 4, 5, 6, 7, 8, 16, 64)
-GOLDEN_MODULES = (2, 6)
-DRAWS = 4  # feature sets for each number of modules
+MODULES = (2, 3, 4, 5, 6, 7, 8, 16, 64)  # where the network takes any number
+DRAWS = 4  # feature sets for each of them, and as many in all where it takes one
 SEED = 20240229
 
 Array = NDArray[np.float64]
@@ -78,11 +77,13 @@ def draw(modules: int, feature_size: int, generator: np.random.Generator) -> Arr
     return features.astype(np.float32).astype(np.float64)
 
 
-def reference(network: BiLSTM) -> Reference:
-    """Runs the network in float64 and float32 on the drawn features of every number of modules."""
+def reference(network: torch.nn.Module, sizes: Network) -> Reference:
+    """Runs the network in float64 and float32 on the drawn features of every number of modules that it takes."""
     generator = np.random.default_rng(SEED)
     exact = copy.deepcopy(network).double()
-    features = {n: [draw(n, network.lstm.input_size, generator) for _ in range(DRAWS)] for n in MODULES}
+    counts = MODULES if sizes.modules is None else (sizes.modules,)
+    draws_each = DRAWS * len(MODULES) // len(counts)
+    features = {n: [draw(n, sizes.feature_size, generator) for _ in range(draws_each)] for n in counts}
     with torch.no_grad():
         actuation = {n: [exact(torch.from_numpy(x)[None])[0].numpy() for x in draws] for n, draws in features.items()}
         rounded = {
@@ -100,7 +101,7 @@ def reference(network: BiLSTM) -> Reference:
     return Reference(features, actuation, max(unscaled.error(rounded).values()), output_range)
 
 
-def weights_sha256(weights: graph.Weights) -> str:
+def weights_sha256(weights: Weights) -> str:
     """SHA-256 over names, shapes and bytes of a state dict, in the order of the names."""
     digest = hashlib.sha256()
     for name in sorted(weights):
@@ -109,15 +110,15 @@ def weights_sha256(weights: graph.Weights) -> str:
     return digest.hexdigest()
 
 
-def verify(path: Path, network: BiLSTM, expected: Reference) -> Report:
-    """All checks of the file at `path` against the network; `expected` is `reference(network)`."""
+def verify(path: Path, network: torch.nn.Module, sizes: Network, expected: Reference) -> Report:
+    """All checks of the file at `path` against the network; `expected` is `reference(network, sizes)`."""
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    layers = network.lstm.num_layers
     check_graph(path)
-    check_weights(path, weights, layers)
-    unit = Unit(path.read_bytes(), str(path))
+    check_weights(path, weights, sizes)
+    unit = unit_of(path.read_bytes(), str(path))
     fused = check_fused(unit, expected)
-    chain, one_sweep_fewer = check_chain(unit, expected)
+    # A network bound to its number of modules has no neighbours that hand it states.
+    chain, one_sweep_fewer = check_chain(unit, expected) if isinstance(unit, Unit) else ({}, {})
     check_guard(unit, expected)
     return Report(expected.bound, expected.torch_error, fused, chain, one_sweep_fewer)
 
@@ -126,7 +127,7 @@ def check_graph(path: Path) -> None:
     """The file is ONNX by the standard's own checker, shapes inferred, of the declared opset and IR version."""
     try:
         onnx.checker.check_model(path, full_check=True)
-        model = onnx.load(path)
+        model = onnx.load(path, load_external_data=False)
     except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError, ValueError) as error:
         raise ModelError(f"the graph is not valid ONNX: {str(error).splitlines()[0]}") from error
     found = (model.ir_version, [(entry.domain, entry.version) for entry in model.opset_import])
@@ -134,10 +135,10 @@ def check_graph(path: Path) -> None:
         raise ModelError(f"the graph is of IR version and opset {found}, expected {IR_VERSION} and {OPSET}")
 
 
-def check_weights(path: Path, weights: graph.Weights, layers: int) -> None:
+def check_weights(path: Path, weights: Weights, sizes: Network) -> None:
     """Every weight, read back with the gate order undone, is bitwise the checkpoint's."""
     try:
-        found = graph.weights_of(onnx.load(path), layers)
+        found = graph.weights_of(onnx.load(path, load_external_data=False), sizes)
     except (KeyError, ValueError) as error:
         raise ModelError(f"the graph lacks weights that the checkpoint has: {error}") from error
     if sorted(found) != sorted(weights):
@@ -150,7 +151,7 @@ def check_weights(path: Path, weights: graph.Weights, layers: int) -> None:
             raise ModelError(f"weight {name}: {changed} of {expected.size} values are not the checkpoint's")
 
 
-def check_fused(unit: Unit, expected: Reference) -> dict[int, float]:
+def check_fused(unit: Unit | BoundUnit, expected: Reference) -> dict[int, float]:
     """All modules in one run give torch's actuation."""
     found = {n: [unit.whole(x) for x in draws] for n, draws in expected.features.items()}
     return _within(expected.error(found), expected.bound, "all modules in one run")
@@ -173,24 +174,28 @@ def check_chain(unit: Unit, expected: Reference) -> tuple[dict[int, float], dict
     return chain, fewer
 
 
-def check_guard(unit: Unit, expected: Reference) -> None:
+def check_guard(unit: Unit | BoundUnit, expected: Reference) -> None:
     """A NaN or an infinity in any feature or any neighbour's state gives NaN in every output at every module."""
-    features = expected.features[3][0].astype(np.float32)
-    states = {name: np.zeros((unit.layers, 1, unit.hidden), dtype=np.float32) for name in FROM_NEIGHBOURS}
+    draws = expected.features[3 if unit.modules is None else unit.modules]
+    features = draws[0].astype(np.float32)
+    states: dict[str, NDArray[np.float32]] = {}
+    if isinstance(unit, Unit):
+        states = {name: np.zeros((unit.layers, 1, unit.hidden), dtype=np.float32) for name in FROM_NEIGHBOURS}
     for bad in (np.nan, np.inf, -np.inf):
         for index in range(unit.feature_size):
             spoilt = features.copy()
             spoilt[index % len(spoilt), index] = bad
             _all_nan(unit, {FEATURES: spoilt[None]}, f"feature {index}")
         for name, state in states.items():
-            for layer in range(unit.layers):
+            for layer, values in enumerate(state):
                 spoilt = state.copy()
-                spoilt[layer, 0, layer % unit.hidden] = bad
+                spoilt[layer, 0, layer % values.size] = bad
                 _all_nan(unit, {FEATURES: features[None], **states, name: spoilt}, f"{name} of layer {layer + 1}")
 
 
-def _all_nan(unit: Unit, inputs: dict[str, NDArray[np.float32]], where: str) -> None:
-    for name, output in zip((ACTUATION, *TO_NEIGHBOURS), unit.session.run(None, inputs), strict=True):
+def _all_nan(unit: Unit | BoundUnit, inputs: dict[str, NDArray[np.float32]], where: str) -> None:
+    names = [output.name for output in unit.session.get_outputs()]
+    for name, output in zip(names, unit.session.run(None, inputs), strict=True):
         if not np.isnan(output).all():
             raise ModelError(f"a value that is not finite in {where} leaves {name} looking sound, expected NaN")
 

@@ -82,12 +82,12 @@ def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
 
 
 def network_of(checkpoint: dict[str, Any], where: str = "checkpoint") -> Network:
-    """The sizes that the checkpoint says its network has; `ModelError` for another network than the biLSTM."""
+    """Which network the checkpoint says it holds, and its sizes; `ModelError` for one that is not exported."""
     try:
         found = {name: value for name, value in checkpoint["network"].items() if name in Network.__struct_fields__}
         return msgspec.convert(found, Network)
     except (AttributeError, msgspec.ValidationError) as error:
-        raise ModelError(f"{where}: network: {error}; expected the sizes of a biLSTM, no other is exported") from error
+        raise ModelError(f"{where}: network: {error}; expected a network of modsoft-train and its sizes") from error
 
 
 def _check(checkpoint: dict[str, Any], path: Path) -> None:
@@ -98,6 +98,9 @@ def _check(checkpoint: dict[str, Any], path: Path) -> None:
         raise ModelError(f"{error}; train it again with this version") from error
     network = network_of(checkpoint, str(path))
     kind, history = robot.robot.kind, network.history
+    bound = None if network.name == "bilstm" else robot.modules
+    if network.modules != bound:
+        raise ModelError(f"{path}: {network.name} of {network.modules} modules, expected {bound}; train it again")
     expected = feature_names(kind, history)
     if list(checkpoint["features"]) != expected:
         raise ModelError(f"{path}: features {list(checkpoint['features'])}, expected for {kind} {expected}")

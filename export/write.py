@@ -9,13 +9,16 @@ from typing import Any
 import msgspec
 
 from modsoft.export import graph, parity, source
+from modsoft.export.nodes import Weights
 from modsoft.runtime import artefact
 from modsoft.runtime import robot as robots
-from modsoft.runtime.artefact import Description, Golden
+from modsoft.runtime.artefact import Description, Golden, Network
 from modsoft.runtime.controller import Controller
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.files import check_writable, written
 from modsoft.training import checkpoint as checkpoints
+
+GOLDEN_MODULES = (2, 6)  # where the network takes any number
 
 
 @dataclass(frozen=True)
@@ -41,27 +44,27 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
     if model.suffix == ".onnx":
         raise UsageError(f"{model}: is ONNX already; did you mean modsoft-export --inspect {model}?")
     checkpoint = source.read(model, None if meta is None else Path(meta))
-    network = checkpoints.network_of(checkpoint)
-    expected = parity.reference(network)
+    network, sizes = checkpoints.network_of(checkpoint), source.network_of(checkpoint)
+    expected = parity.reference(network, sizes)
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    described = describe(checkpoint, weights, expected)
+    described = describe(checkpoint, sizes, weights, expected)
     try:
         text = msgspec.json.encode(described).decode()
     except TypeError as error:
         raise ModelError(f"{model}: provenance that is no plain value ({error})") from error
-    content = artefact.sealed(graph.build(weights, network.lstm.num_layers, text).SerializeToString())
+    content = artefact.sealed(graph.build(weights, sizes, text).SerializeToString())
 
     with written(out) as temporary:
         temporary.write_bytes(content)
         try:
-            report = parity.verify(temporary, network, expected)
+            report = parity.verify(temporary, network, sizes, expected)
             described = Controller.load(temporary).description  # as the lab PC will, golden pairs included
         except ModelError as error:
             raise ModelError(f"{out} not written: {str(error).replace(str(temporary), out.name)}") from error
     return Exported(out, described, report)
 
 
-def describe(checkpoint: dict[str, Any], weights: graph.Weights, expected: parity.Reference) -> Description:
+def describe(checkpoint: dict[str, Any], sizes: Network, weights: Weights, expected: parity.Reference) -> Description:
     """The description of the model to be, its seal not yet set."""
     robot = robots.from_dict(checkpoint["robot"])
     return Description(
@@ -70,7 +73,7 @@ def describe(checkpoint: dict[str, Any], weights: graph.Weights, expected: parit
         weights_sha256=parity.weights_sha256(weights),
         opset=artefact.OPSET,
         ir_version=artefact.IR_VERSION,
-        sequence_axis="modules",
+        sequence_axis=sizes.sequence_axis,
         kind=robot.robot.kind,
         state_size=robot.state_size,
         action_size=robot.action_size,
@@ -78,11 +81,11 @@ def describe(checkpoint: dict[str, Any], weights: graph.Weights, expected: parit
         modules_trained_on=[robot.modules],
         features=list(checkpoint["features"]),
         label=artefact.LABEL,
-        network=source.network_of(checkpoint),
+        network=sizes,
         tolerance=expected.tolerance,
         golden=[
             Golden(features=expected.features[n][0].tolist(), actuation=expected.actuation[n][0].tolist())
-            for n in parity.GOLDEN_MODULES
+            for n in (GOLDEN_MODULES if sizes.modules is None else [sizes.modules])
         ],
         robot=checkpoint["robot"],
         provenance=checkpoint["provenance"],

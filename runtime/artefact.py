@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Meta
 
 from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import check_is_file
 
 SCHEMA: Literal[1] = 1
 METADATA_KEY = "modsoft"
@@ -39,15 +40,21 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """A part of the description: every key is known, nothing changes after reading."""
 
 
-class Network(Record, frozen=True):
-    """The sizes of the network of Table S1."""
+class Network(Record, frozen=True, omit_defaults=True):
+    """Which network of Table S1, and its sizes."""
 
-    name: Literal["bilstm"]
+    name: Literal["bilstm", "lstm", "module-lstm"]
     feature_size: Size
     action_size: Size
     layers: Size
     hidden: Size
     history: Size  # T, time steps
+    modules: Size | None = None  # N that the network is bound to; the biLSTM takes any
+
+    @property
+    def sequence_axis(self) -> Literal["modules", "time"]:
+        """What an element of the sequence is."""
+        return "modules" if self.name == "bilstm" else "time"
 
 
 class Golden(Record, frozen=True):
@@ -65,7 +72,7 @@ class Description(Record, frozen=True):
     weights_sha256: str
     opset: int
     ir_version: int
-    sequence_axis: Literal["modules"]
+    sequence_axis: Literal["modules", "time"]
     kind: str
     state_size: Size
     action_size: Size
@@ -103,8 +110,7 @@ def sealed(model: bytes) -> bytes:
 
 def read(path: Path) -> bytes:
     """The bytes of a model file whose seal holds, else `ModelError`."""
-    if not path.is_file():
-        raise ModelError(f"no model file {path}; modsoft-export model.pt makes one")
+    check_is_file(path, "model file", "modsoft-export model.pt makes one")
     try:
         model = path.read_bytes()
     except OSError as error:

@@ -1,4 +1,5 @@
-"""The controller: the exported biLSTM unit, run over all modules of the robot in one go or as a chain of units.
+"""The controller: the exported biLSTM unit, run over all modules of the robot in one go or as a chain of units, or an
+exported network that is bound to its number of modules.
 
 `Controller.load` believes nothing: the seal, the description, the graph's border and the golden pairs are all proven
 before the first control step, and `check` proves that model and robot belong together.
@@ -6,6 +7,7 @@ before the first control step, and `check` proves that model and robot belong to
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -31,25 +33,43 @@ REFUSED = (
 )
 
 
+def _opened(model: bytes, where: str) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1  # more gains nothing below 16 modules, and collapses beside a busy process
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    # A stranger's model gets no other file: weights outside it would be read from the current folder, and the other
+    # format that onnxruntime takes is one that no check here knows.
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except REFUSED as error:
+        first = str(error).splitlines()[0]
+        raise ModelError(f"{where}: onnxruntime {onnxruntime.__version__} refuses it ({first})") from error
+
+
+def _actuation(session: onnxruntime.InferenceSession, features: ArrayLike) -> Array:
+    """Features (N, F) to actuation (N, A) in one run."""
+    segment = np.asarray(features, dtype=np.float32)[None]
+    return session.run([ACTUATION], {FEATURES: segment})[0][0].astype(np.float64)
+
+
 class Unit:
     """The graph over a segment of contiguous modules, in onnxruntime (Figure 1-(D))."""
 
-    def __init__(self, model: bytes, where: str = "model"):
-        """`model`: a serialised ONNX model; `where` is named in the errors."""
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1  # more gains nothing below 16 modules, and collapses beside a busy process
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        try:
-            self.session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        except REFUSED as error:
-            first = str(error).splitlines()[0]
-            raise ModelError(f"{where}: onnxruntime {onnxruntime.__version__} refuses it ({first})") from error
+    modules: int | None = None  # that it is bound to: none
+
+    def __init__(self, session: onnxruntime.InferenceSession, where: str = "model"):
+        """`where` is named in the errors."""
+        self.session = session
         self.where = where
         self._check_border()
         self.feature_size: int = self.session.get_inputs()[0].shape[2]
         self.action_size: int = self.session.get_outputs()[0].shape[2]
         self.layers, _, self.hidden = self.session.get_overridable_initializers()[0].shape
+        self.sizes = {"feature_size": self.feature_size, "action_size": self.action_size, "modules": None}
+        self.sizes |= {"layers": self.layers, "hidden": self.hidden}
 
     def _check_border(self) -> None:
         session = self.session
@@ -67,8 +87,7 @@ class Unit:
 
     def whole(self, features: ArrayLike) -> Array:
         """Features (N, F) of all modules to actuation (N, A): one run, no neighbours beyond the ends."""
-        segment = np.asarray(features, dtype=np.float32)[None]
-        return self.session.run([ACTUATION], {FEATURES: segment})[0][0].astype(np.float64)
+        return _actuation(self.session, features)
 
     def chain(self, features: ArrayLike, sweeps: int | None = None) -> Array:
         """The same by single modules that know only their neighbours' states, in alternating sweeps, base to tip first.
@@ -91,10 +110,41 @@ class Unit:
         return actuation
 
 
+class BoundUnit:
+    """The graph of a network that is bound to its number of modules N (Table S1: LSTM, four LSTM), in onnxruntime."""
+
+    def __init__(self, session: onnxruntime.InferenceSession, where: str = "model"):
+        """`where` is named in the errors."""
+        self.session = session
+        self.where = where
+        inputs, outputs = session.get_inputs(), session.get_outputs()
+        names, wanted = ([i.name for i in inputs], [o.name for o in outputs]), ([FEATURES], [ACTUATION])
+        if names != wanted:
+            raise ModelError(f"{where}: inputs and outputs are {names}, expected {wanted}; export it again")
+        shapes = [inputs[0].shape, outputs[0].shape]
+        if any(len(shape) != 3 or not all(isinstance(size, int) for size in shape) for shape in shapes):
+            raise ModelError(f"{where}: features, actuation of shapes {shapes}, expected fixed (1, N, F) and (1, N, A)")
+        self.modules: int = shapes[0][1]
+        self.feature_size: int = shapes[0][2]
+        self.action_size: int = shapes[1][2]
+        self.sizes = {"feature_size": self.feature_size, "action_size": self.action_size, "modules": self.modules}
+
+    def whole(self, features: ArrayLike) -> Array:
+        """Features (N, F) of all modules to actuation (N, A)."""
+        return _actuation(self.session, features)
+
+
+def unit_of(model: bytes, where: str = "model") -> Unit | BoundUnit:
+    """A serialised ONNX model, ready to run: a unit where it takes neighbours' states, else one bound to its number of
+    modules. `ModelError` for any other; `where` is named in it."""
+    session = _opened(model, where)
+    return Unit(session, where) if session.get_overridable_initializers() else BoundUnit(session, where)
+
+
 class Controller:
     """A model file, proven and ready to run. `description` says what it is, `history` is its T."""
 
-    def __init__(self, unit: Unit, description: Description):
+    def __init__(self, unit: Unit | BoundUnit, description: Description):
         self.unit = unit
         self.description = description
         self.where = unit.where
@@ -104,7 +154,7 @@ class Controller:
         """Opens a model file; `ModelError` for one that is damaged, of another schema, at odds with its own
         description, or that answers the golden pairs otherwise than torch did."""
         path = Path(path)
-        unit = Unit(artefact.read(path), str(path))
+        unit = unit_of(artefact.read(path), str(path))
         text = unit.session.get_modelmeta().custom_metadata_map.get(artefact.METADATA_KEY)
         if text is None:
             raise ModelError(f"{path}: no metadata {artefact.METADATA_KEY!r} in it, expected a file of modsoft-export")
@@ -131,10 +181,8 @@ class Controller:
             "action size": (said.action_size, len(kind.action)),
             "actuation of the graph": (self.unit.action_size, said.action_size),
             "features of the graph": (self.unit.feature_size, len(said.features)),
-            "network": (
-                (network.feature_size, network.action_size, network.layers, network.hidden),
-                (self.unit.feature_size, self.unit.action_size, self.unit.layers, self.unit.hidden),
-            ),
+            "sequence axis": (said.sequence_axis, network.sequence_axis),
+            "network": ({name: getattr(network, name) for name in self.unit.sizes}, self.unit.sizes),
             "features": (said.features, configuration.feature_names(said.kind, network.history)),
         }
         for name, (found, expected) in pairs.items():
@@ -157,7 +205,8 @@ class Controller:
                 )
 
     def check(self, robot: Robot) -> None:
-        """Raises `ModelError` unless the model was trained for robots like this one; their module number is free."""
+        """Raises `ModelError` unless the model was trained for robots like this one; their module number is free unless
+        the network is bound to one."""
         said = self.description
         pairs = {
             "kind": (said.kind, robot.robot.kind),
@@ -165,6 +214,8 @@ class Controller:
             "action size": (said.action_size, robot.action_size),
             "period_s": (said.period_s, robot.loop.period_s),
         }
+        if self.unit.modules is not None:
+            pairs["modules"] = (self.unit.modules, robot.modules)
         wrong = [name for name, (found, expected) in pairs.items() if found != expected]
         if "period_s" in wrong and np.isclose(said.period_s, robot.loop.period_s, rtol=1e-6, atol=0.0):
             wrong.remove("period_s")
@@ -182,12 +233,18 @@ class Controller:
 
     def actuate(self, features: ArrayLike) -> Array:
         """Features (N, F) of this control step to actuation (N, A), not limited. Raises `ModelError` for fewer than
-        two modules, another number of features, or anything not finite, in or out."""
+        two modules, another number than the network is bound to, another number of features, or anything not finite,
+        in or out."""
         with np.errstate(over="ignore"):  # a value too large for float32 is infinite there, and refused below
             narrowed = np.asarray(features, dtype=np.float64).astype(np.float32)
         if narrowed.ndim != 2 or narrowed.shape[0] < 2 or narrowed.shape[1] != self.unit.feature_size:
             raise ModelError(
                 f"{self.where}: features of shape {narrowed.shape}, expected (N, {self.unit.feature_size}) with N >= 2"
+            )
+        if self.unit.modules not in (None, len(narrowed)):
+            raise ModelError(
+                f"{self.where}: a robot of {len(narrowed)} modules; the network {self.description.network.name} is "
+                f"bound to {self.unit.modules}, a biLSTM serves any number"
             )
         finite = np.isfinite(narrowed)
         if not finite.all():

@@ -7,11 +7,15 @@ import torch
 from onnx.reference import ReferenceEvaluator
 
 from modsoft.export import graph
-from modsoft.runtime.artefact import ACTUATION, FEATURES, FROM_NEIGHBOURS, TO_NEIGHBOURS
-from modsoft.runtime.controller import Unit
+from modsoft.runtime.artefact import ACTUATION, FEATURES, FROM_NEIGHBOURS, TO_NEIGHBOURS, Network
+from modsoft.runtime.controller import unit_of
 from modsoft.training.networks import BiLSTM
 
 F, A = 7, 2
+
+
+def sizes(layers, hidden):
+    return Network(name="bilstm", feature_size=F, action_size=A, layers=layers, hidden=hidden, history=1)
 
 
 def network_and_weights(layers, hidden, seed=0):
@@ -27,8 +31,8 @@ def features(modules, seed=1):
 @pytest.mark.parametrize(("layers", "hidden"), [(1, 1), (2, 5), (4, 8)])
 def test_weights_come_back_bit_for_bit(layers, hidden):
     _, weights = network_and_weights(layers, hidden)
-    model = onnx.load_from_string(graph.build(weights, layers, "{}").SerializeToString())
-    found = graph.weights_of(model, layers)
+    model = onnx.load_from_string(graph.build(weights, sizes(layers, hidden), "{}").SerializeToString())
+    found = graph.weights_of(model, sizes(layers, hidden))
     assert found.keys() == weights.keys()
     for name in weights:
         np.testing.assert_array_equal(found[name], weights[name])
@@ -38,8 +42,8 @@ def test_weights_come_back_bit_for_bit(layers, hidden):
 def test_third_opinion(layers, hidden):
     """onnx's evaluator, onnxruntime and torch agree, in a whole robot and with neighbours' states fed."""
     network, weights = network_and_weights(layers, hidden)
-    model = graph.build(weights, layers, "{}")
-    evaluator, unit = ReferenceEvaluator(model), Unit(model.SerializeToString())
+    model = graph.build(weights, sizes(layers, hidden), "{}")
+    evaluator, unit = ReferenceEvaluator(model), unit_of(model.SerializeToString())
     for modules in (1, 2, 5):
         x = features(modules)
         with torch.no_grad():
@@ -58,7 +62,7 @@ def test_third_opinion(layers, hidden):
 @pytest.mark.parametrize("layers", [1, 2, 3])
 def test_chain_needs_one_sweep_more_than_layers(layers):
     _, weights = network_and_weights(layers, 8)
-    unit = Unit(graph.build(weights, layers, "{}").SerializeToString())
+    unit = unit_of(graph.build(weights, sizes(layers, 8), "{}").SerializeToString())
     for modules in (2, 3, 7):
         x = features(modules)
         whole = unit.whole(x)
@@ -70,7 +74,7 @@ def test_chain_needs_one_sweep_more_than_layers(layers):
 def test_segments_make_the_whole():
     """A robot cut into two segments, each told the other's states: one sweep of each a layer, as for single modules."""
     _, weights = network_and_weights(2, 8)
-    unit = Unit(graph.build(weights, 2, "{}").SerializeToString())
+    unit = unit_of(graph.build(weights, sizes(2, 8), "{}").SerializeToString())
     x = features(6)
     to_base, to_tip = {}, {}
     for _ in range(3):
@@ -85,7 +89,7 @@ def test_segments_make_the_whole():
 def test_standard_operators_only():
     """Nothing a small runtime would lack; one LSTM a layer, so that a viewer shows the paper's diagram."""
     _, weights = network_and_weights(4, 8)
-    model = graph.build(weights, 4, "{}")
+    model = graph.build(weights, sizes(4, 8), "{}")
     assert {node.domain for node in model.graph.node} == {""}
     assert sum(node.op_type == "LSTM" for node in model.graph.node) == 4
     assert len(model.graph.node) == 32

@@ -6,9 +6,9 @@ import pytest
 import torch
 from onnx import helper, numpy_helper
 
-from modsoft.export import graph, parity, write
+from modsoft.export import graph, parity, source, write
 from modsoft.export.write import export
-from modsoft.runtime.controller import Unit
+from modsoft.runtime.controller import unit_of
 from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
 
@@ -147,42 +147,48 @@ CHECKS = {
 }
 
 
+def loaded(checkpoint):
+    """The network in a checkpoint, and its sizes."""
+    stored = checkpoints.load(checkpoint)
+    return checkpoints.network_of(stored), source.network_of(stored)
+
+
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory, make_checkpoint):
-    """A sound export: its checkpoint, network, reference and model file."""
+    """A sound export: its checkpoint, network, sizes, reference and model file."""
     checkpoint = make_checkpoint(tmp_path_factory.mktemp("sound") / "model.pt")
-    network = checkpoints.network_of(checkpoints.load(checkpoint))
-    return checkpoint, network, parity.reference(network), export(checkpoint).path
+    network, sizes = loaded(checkpoint)
+    return checkpoint, network, sizes, parity.reference(network, sizes), export(checkpoint).path
 
 
-def run(check, path, network, expected):
+def run(check, path, network, sizes, expected):
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     if check == "graph":
         return parity.check_graph(path)
     if check == "weights":
-        return parity.check_weights(path, weights, network.lstm.num_layers)
+        return parity.check_weights(path, weights, sizes)
     if check == "fused":
-        return parity.check_fused(Unit(path.read_bytes()), expected)
+        return parity.check_fused(unit_of(path.read_bytes()), expected)
     if check == "chain":
-        return parity.check_chain(Unit(path.read_bytes()), expected)
-    return parity.check_guard(Unit(path.read_bytes()), expected)
+        return parity.check_chain(unit_of(path.read_bytes()), expected)
+    return parity.check_guard(unit_of(path.read_bytes()), expected)
 
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_sound_file_passes_each_check(check, sound):
-    _, network, expected, path = sound
-    run(check, path, network, expected)
+    _, network, sizes, expected, path = sound
+    run(check, path, network, sizes, expected)
 
 
 @pytest.mark.parametrize(("check", "fault"), [(check, fault) for check in CHECKS for fault in sorted(CHECKS[check])])
 def test_each_check_finds_its_faults(check, fault, sound, tmp_path):
-    _, network, expected, path = sound
+    _, network, sizes, expected, path = sound
     model = onnx.load(path)
     FAULTS[fault](model)
     spoilt = tmp_path / "spoilt.onnx"
     spoilt.write_bytes(model.SerializeToString())
     with pytest.raises(ModelError):
-        run(check, spoilt, network, expected)
+        run(check, spoilt, network, sizes, expected)
 
 
 def test_every_fault_is_some_checks():
@@ -213,16 +219,16 @@ def test_fixed_bound_where_torch_is_exact_and_none_beyond_a_thousandth():
 
 def test_a_network_that_ignores_its_neighbours_is_refused(sound, tmp_path, make_checkpoint):
     """The negative control: without recurrent weights a chain is right at once, and so proves nothing."""
-    network = checkpoints.network_of(checkpoints.load(make_checkpoint(tmp_path / "model.pt")))
+    network, sizes = loaded(make_checkpoint(tmp_path / "model.pt"))
     with torch.no_grad():
         for name, weight in network.named_parameters():
             if "weight_hh" in name:
                 weight.zero_()
             elif "bias" in name and "lstm" in name:  # forget gate shut: the cell state carries nothing either
                 weight[weight.shape[0] // 4 : weight.shape[0] // 2] = -100.0
-    expected = parity.reference(network)
+    expected = parity.reference(network, sizes)
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    unit = Unit(graph.build(weights, 2, "{}").SerializeToString())
+    unit = unit_of(graph.build(weights, sizes, "{}").SerializeToString())
     parity.check_fused(unit, expected)
     with pytest.raises(ModelError, match="no difference"):
         parity.check_chain(unit, expected)

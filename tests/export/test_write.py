@@ -87,7 +87,9 @@ def of(weights, change):
     [
         (lambda c: {"features": c["features"][::-1]}, "features .* expected for pneumatic"),
         (lambda c: {"network": {**c["network"], "history": 4}}, "expected for pneumatic"),
-        (lambda c: {"network": {**c["network"], "name": "lstm"}}, "network: Invalid enum value 'lstm'"),
+        (lambda c: {"network": {**c["network"], "name": "gru"}}, "network: Invalid enum value 'gru'"),
+        (lambda c: {"network": {**c["network"], "name": "lstm"}}, "lstm of None modules, expected 3"),
+        (lambda c: {"network": {**c["network"], "modules": 3}}, "bilstm of 3 modules, expected None"),
         (lambda c: {"network": {**c["network"], "hidden": 9}}, "do not fit"),
         (lambda c: {"network": {k: v for k, v in c["network"].items() if k != "history"}}, "required field `history`"),
         (lambda c: {"robot": {**c["robot"], "wheels": 4}}, "wheels"),

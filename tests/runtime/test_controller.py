@@ -9,7 +9,7 @@ import pytest
 
 from modsoft.runtime import artefact, configuration
 from modsoft.runtime import robot as robots
-from modsoft.runtime.controller import Controller, Unit
+from modsoft.runtime.controller import Controller, unit_of
 from modsoft.runtime.errors import ModelError
 
 onnx = pytest.importorskip("onnx")  # to spoil files with; the controller itself needs none
@@ -222,7 +222,7 @@ def test_another_border_is_refused(model_file):
     model = onnx.load(model_file)
     model.graph.output.pop()
     with pytest.raises(ModelError, match="inputs, states, outputs"):
-        Unit(model.SerializeToString())
+        unit_of(model.SerializeToString())
 
 
 def test_needs_no_torch_and_no_onnx(model_file):
