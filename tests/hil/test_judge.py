@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from modsoft.hil import judge as judging
-from modsoft.hil.judge import Record, Valves, judge
+from modsoft.hil.judge import judge
+from modsoft.hil.record import Record, Valves
+from modsoft.hil.valves import valve_difference
 from modsoft.runtime import robot as robots
 from modsoft.runtime.actuation import channel_pressures_bar
 from modsoft.runtime.configuration import bending_angle_deg, from_angles_deg
@@ -254,8 +256,8 @@ def test_a_valve_that_answers_another_channel_fails(flawless):
 
 
 def test_every_tick_is_compared(flawless):
-    assert np.isfinite(judging.valve_difference(flawless)).all()
-    assert np.nanmax(judging.valve_difference(flawless)) <= 0.5
+    assert np.isfinite(valve_difference(flawless)).all()
+    assert np.nanmax(valve_difference(flawless)) <= 0.5
 
 
 def test_one_count_is_rounding(flawless):

@@ -8,18 +8,22 @@ or a file; `modsoft.hil.record` does.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.hil.record import Array, Record
+from modsoft.hil.valves import (
+    ACKNOWLEDGED_P99_MS,
+    full_counts_per_bar,
+    largest_duty_before,
+    valve_difference,
+    valve_excursion,
+    vent_limit_ms,
+    vented_after_ms,
+)
 from modsoft.runtime.configuration import angle_between_deg, bending_error_deg
-from modsoft.runtime.robot import Robot
 from modsoft.runtime.tally import spread
-
-Array = NDArray[np.float64]
 
 # ---- What a run has to show -------------------------------------------------------------------------------------
 
@@ -27,7 +31,6 @@ FEWEST_TICKS = 100  # below it a 99th percentile says nothing
 MISSED_TICKS = 0
 HELD_TICKS = 0
 LATENESS_P99_MS = 20.0
-ACKNOWLEDGED_P99_MS = 30.0
 VALVE_COUNTS = 1.0  # of the timer: a set-point is rounded to counts once
 DROPPED_BYTES = 0
 CHAMBERS_AT_END_BAR = 0.02
@@ -47,66 +50,6 @@ TRACKING_DEG: dict[tuple[str, int], list[float]] = {
 BOARD_LATE_MS = 100.0
 BOARD_SLIPPED_PERCENT = 0.5  # of the run, in stalls
 PLANT_LATE_MS = 100.0
-FOR_EVER_NS = 1 << 62
-SETTLING_S = 0.03  # after acknowledgement and slew: some loops of the firmware; the board's lateness comes on top
-
-
-class Valves(NamedTuple):
-    """Duties of all channels from the timer registers. Row j holds from mono_ns[j] until mono_ns[j + 1]."""
-
-    mono_ns: NDArray[np.int64]  # (E,)
-    duty: Array  # (E, channels)
-    counts: int  # of a full duty
-
-    def between(self, start_ns: int, end_ns: int) -> Array:
-        """Every duty (n, channels) that stood at some time in [start, end]; zeros before the first row."""
-        first = int(np.searchsorted(self.mono_ns, start_ns, side="right")) - 1
-        last = int(np.searchsorted(self.mono_ns, end_ns, side="right"))
-        rows = self.duty[max(first, 0) : last]
-        return np.vstack([np.zeros((1, self.duty.shape[1])), rows]) if first < 0 else rows
-
-
-@dataclass(frozen=True)
-class Record:
-    """A run, as the three sources tell it. K ticks, N modules, M slices of the plant; times are CLOCK_MONOTONIC."""
-
-    robot: Robot
-    task: str
-    asked: Array  # (steps, N, 3) desired configurations of the task, by the rig's own reading of it
-    runtime_exit: int
-    runtime_said: str  # its last line, for a run that failed
-    tick: NDArray[np.int64]  # (K,)
-    mono_ns: NDArray[np.int64]  # (K,) start of the tick
-    lateness_ms: Array  # (K,)
-    missed: int
-    held: int
-    desired: Array  # (K, N, 3)
-    configuration: Array  # (K, N, 3), NaN where no frame was good
-    frame_mono_ns: NDArray[np.int64]  # (K,) when the frame used came in
-    start_ns: int | None  # just before the first set-point; None: the runtime never gave one
-    start_bar: Array  # (channels,) that set-point, in force until the first tick
-    commanded_bar: Array  # (K, channels)
-    slew_bar_per_s: float  # of the board, or the robot file's where that is slower
-    acknowledged_ms: Array  # (K,), NaN where none came
-    faults: NDArray[np.int64]  # (K,)
-    state: list[str]  # (K,) the board's
-    end_ns: int  # the vent begins: outputs no longer follow the last tick
-    said_vented: bool  # the runtime, on the board's word
-    valves: Valves
-    board_events: list[dict[str, Any]]  # resets and watchdog, all of the emulator's life
-    board_dropped_bytes: float  # by the board's receiver; NaN where it did not say
-    board_late_ms: float  # largest lateness of emulated time in the run
-    board_slipped_percent: float  # of the run, where emulated time gave way
-    board_summary: dict[str, Any]
-    plant_mono_ns: NDArray[np.int64]  # (M,)
-    plant_configuration: Array  # (M, N, 3)
-    plant_bar: Array  # (M, N, 2)
-    plant_late_ms: Array  # of the slices in the run
-
-    @property
-    def steps(self) -> int:
-        """Ticks that the run should have."""
-        return len(self.asked)
 
 
 class Acceptance(NamedTuple):
@@ -147,91 +90,6 @@ def p99(values: Array) -> float:
 def tracking_error_deg(record: Record) -> Array:
     """|bending angle measured at the start of tick k - desired angle of tick k|, (K, N): the paper's convention."""
     return bending_error_deg(record.configuration, record.desired)
-
-
-class Span(NamedTuple):
-    """A set-point in force, and the one before it, in counts of every channel that the board has. It is taken at some
-    time after `from_ns` and reached by `settled_ns`."""
-
-    before: Array
-    commanded: Array
-    from_ns: int
-    settled_ns: int
-    until_ns: int
-
-
-def spans(record: Record) -> Iterator[Span]:
-    """Every set-point: the first one, those of the ticks, and at last the vent, which is a set-point of 0 for ever."""
-    if record.start_ns is None:
-        return
-    channels = record.valves.duty.shape[1]
-    scale = full_counts_per_bar(record)
-    set_points_bar = [record.start_bar[:channels], *record.commanded_bar[:, :channels], np.zeros(channels)]
-    begins_ns = [record.start_ns, *(int(at) for at in record.mono_ns), record.end_ns, FOR_EVER_NS]
-    took_ms = [ACKNOWLEDGED_P99_MS, *np.nan_to_num(record.acknowledged_ms, nan=ACKNOWLEDGED_P99_MS)]
-    took_ms.append(ACKNOWLEDGED_P99_MS)
-    before = np.zeros(channels)
-    for k, commanded in enumerate(set_points_bar):
-        slew_s = float(np.max(np.abs(commanded - before))) / record.slew_bar_per_s
-        settling_s = took_ms[k] * 1e-3 + slew_s + SETTLING_S + np.nan_to_num(record.board_late_ms) * 1e-3
-        settled_ns = begins_ns[k] + round(settling_s * 1e9)
-        yield Span(before * scale, commanded * scale, begins_ns[k], settled_ns, begins_ns[k + 1])
-        before = commanded
-
-
-def full_counts_per_bar(record: Record) -> float:
-    assert record.robot.valve is not None  # the rig runs no other robots
-    return record.valves.counts / record.robot.valve.full_scale_bar
-
-
-def valve_difference(record: Record) -> Array:
-    """Largest difference (K + 1,) of timer registers from what the log says was commanded, in counts, over all channels
-    and all the time from when the slew must have settled until the next tick starts; the first is that of the set-point
-    before the first tick. NaN: no such time."""
-    channels = record.valves.duty.shape[1]
-    if record.commanded_bar[:, channels:].any():
-        return np.full(len(record.tick) + 1, np.inf)  # a set-point for a channel that the board does not have
-    worst = []
-    for span in list(spans(record))[:-1]:  # the vent has its own line
-        worst.append(math.nan)
-        if span.settled_ns <= span.until_ns:
-            stood = record.valves.between(span.settled_ns, span.until_ns) * record.valves.counts
-            worst[-1] = float(np.max(np.abs(stood - span.commanded)))
-    return np.array(worst)
-
-
-def valve_excursion(record: Record) -> Array:
-    """Largest distance (K + 2,) of any timer register, at any time, from the range between the set-point in force and
-    the one before it, in counts; the last is that of the vent."""
-    worst = []
-    for span in spans(record):
-        stood = record.valves.between(span.from_ns, span.until_ns) * record.valves.counts
-        low, high = np.minimum(span.before, span.commanded), np.maximum(span.before, span.commanded)
-        worst.append(np.max(np.maximum(low - stood, stood - high), initial=0.0))
-    return np.array(worst)
-
-
-def largest_duty_before(record: Record) -> float:
-    """Of all channels, until the runtime gave its first set-point; ever, where it gave none."""
-    until_ns = FOR_EVER_NS if record.start_ns is None else record.start_ns
-    return float(np.max(record.valves.between(-FOR_EVER_NS, until_ns)))
-
-
-def vented_after_ms(record: Record) -> float:
-    """From the beginning of the vent until every timer register is at 0 for good; infinite where one never is."""
-    told = np.flatnonzero(record.valves.duty.any(axis=1))
-    if not len(told):
-        return 0.0
-    if told[-1] + 1 == len(record.valves.duty):
-        return math.inf
-    return max(0.0, float(record.valves.mono_ns[told[-1] + 1] - record.end_ns) * 1e-6)
-
-
-def vent_limit_ms(record: Record) -> float:
-    """The way from the largest pressure down, at the board's slew, after a request as slow as an acknowledgement."""
-    assert record.robot.valve is not None
-    way_s = record.robot.valve.p_max_bar / record.slew_bar_per_s
-    return ACKNOWLEDGED_P99_MS + (way_s + SETTLING_S) * 1e3 + float(np.nan_to_num(record.board_late_ms))
 
 
 def desired_off(record: Record) -> float:

@@ -4,21 +4,81 @@ from __future__ import annotations
 
 import hashlib
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from modsoft.hil.emulator import FIRMWARE, FIRMWARE_ELF
-from modsoft.hil.judge import Record, Valves
 from modsoft.runtime import log
 from modsoft.runtime.protocol import CHANNELS, to_bar
 from modsoft.runtime.robot import Robot
 
+Array = NDArray[np.float64]
 Line = dict[str, Any]
 
 LATE_BOUND_MS = 20.0  # board.c: emulated time never falls further behind, it gives way and says `late`
+
+
+class Valves(NamedTuple):
+    """Duties of all channels from the timer registers. Row j holds from mono_ns[j] until mono_ns[j + 1]."""
+
+    mono_ns: NDArray[np.int64]  # (E,)
+    duty: Array  # (E, channels)
+    counts: int  # of a full duty
+
+    def between(self, start_ns: int, end_ns: int) -> Array:
+        """Every duty (n, channels) that stood at some time in [start, end]; zeros before the first row."""
+        first = int(np.searchsorted(self.mono_ns, start_ns, side="right")) - 1
+        last = int(np.searchsorted(self.mono_ns, end_ns, side="right"))
+        rows = self.duty[max(first, 0) : last]
+        return np.vstack([np.zeros((1, self.duty.shape[1])), rows]) if first < 0 else rows
+
+
+@dataclass(frozen=True)
+class Record:
+    """A run, as the three sources tell it. K ticks, N modules, M slices of the plant; times are CLOCK_MONOTONIC."""
+
+    robot: Robot
+    task: str
+    asked: Array  # (steps, N, 3) desired configurations of the task, by the rig's own reading of it
+    runtime_exit: int
+    runtime_said: str  # its last line, for a run that failed
+    tick: NDArray[np.int64]  # (K,)
+    mono_ns: NDArray[np.int64]  # (K,) start of the tick
+    lateness_ms: Array  # (K,)
+    missed: int
+    held: int
+    desired: Array  # (K, N, 3)
+    configuration: Array  # (K, N, 3), NaN where no frame was good
+    frame_mono_ns: NDArray[np.int64]  # (K,) when the frame used came in
+    start_ns: int | None  # just before the first set-point; None: the runtime never gave one
+    start_bar: Array  # (channels,) that set-point, in force until the first tick
+    commanded_bar: Array  # (K, channels)
+    slew_bar_per_s: float  # of the board, or the robot file's where that is slower
+    acknowledged_ms: Array  # (K,), NaN where none came
+    faults: NDArray[np.int64]  # (K,)
+    state: list[str]  # (K,) the board's
+    end_ns: int  # the vent begins: outputs no longer follow the last tick
+    said_vented: bool  # the runtime, on the board's word
+    valves: Valves
+    board_events: list[dict[str, Any]]  # resets and watchdog, all of the emulator's life
+    board_dropped_bytes: float  # by the board's receiver; NaN where it did not say
+    board_late_ms: float  # largest lateness of emulated time in the run
+    board_slipped_percent: float  # of the run, where emulated time gave way
+    board_summary: dict[str, Any]
+    plant_mono_ns: NDArray[np.int64]  # (M,)
+    plant_configuration: Array  # (M, N, 3)
+    plant_bar: Array  # (M, N, 2)
+    plant_late_ms: Array  # of the slices in the run
+
+    @property
+    def steps(self) -> int:
+        """Ticks that the run should have."""
+        return len(self.asked)
 
 
 def read(folder: Path, run: Path | None, robot: Robot, task: str, asked: np.ndarray, runtime_exit: int) -> Record:

@@ -10,14 +10,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from modsoft.hil.judge import (
-    Acceptance,
-    Record,
-    Verdict,
-    measured_off_deg,
-    tracking_error_deg,
-    valve_difference,
-)
+from modsoft.hil.judge import Acceptance, Verdict, measured_off_deg, tracking_error_deg
+from modsoft.hil.record import Record
+from modsoft.hil.valves import valve_difference
 from modsoft.runtime.configuration import angle_between_deg, bending_angle_deg
 from modsoft.runtime.tally import spread
 
