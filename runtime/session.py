@@ -127,7 +127,7 @@ def run(options: Options) -> None:
             if board is not None:
                 board.arm(robot)
             judge = FrameJudge(robot)  # a new one: Enter may have been long in coming
-            rest = _rest(slot, judge, stop)
+            rest = _rest(slot, judge, stop, missing=LostInRun)
             with StatusLine(lambda: _status(tally, log), sys.stderr):
                 Loop(
                     robot, controller, desired, slot, judge, board or Rehearsal(),
@@ -232,8 +232,15 @@ def _task(task: str, robot: Robot) -> Array:
     return load_task(task, robot)
 
 
-def _rest(slot: Slot, judge: FrameJudge, stop: Stop, now: Callable[[], float] = time.monotonic) -> Array:
-    """The configuration (N, 3) in which the vented robot hangs; waits for the tracker's first good frame."""
+def _rest(
+    slot: Slot,
+    judge: FrameJudge,
+    stop: Stop,
+    now: Callable[[], float] = time.monotonic,
+    missing: type[ModsoftError] = DeviceAbsent,
+) -> Array:
+    """The configuration (N, 3) in which the vented robot hangs; waits for the tracker's first good frame. Raises
+    `missing` where there is none."""
     until_s = now() + FIRST_FRAME_WAIT_S
     while True:
         frame = slot.latest()
@@ -242,10 +249,10 @@ def _rest(slot: Slot, judge: FrameJudge, stop: Stop, now: Callable[[], float] = 
             check_rest(judged.configuration, frame.poses)
             return judged.configuration
         if slot.error is not None:
-            raise DeviceAbsent(f"tracker: {slot.error}")
+            raise missing(f"tracker: {slot.error}")
         if now() > until_s:
             detail = f" ({judged.detail})" if judged.detail else ""
-            raise DeviceAbsent(
+            raise missing(
                 f"tracker: no good frame within {FIRST_FRAME_WAIT_S:.0f} s, the last one {judged.word}{detail}; "
                 "are all tools in view?"
             )

@@ -54,3 +54,11 @@ def model_file(tmp_path_factory, make_checkpoint):
     from modsoft.export.write import export
 
     return export(make_checkpoint(tmp_path_factory.mktemp("model") / "model.pt")).path
+
+
+@pytest.fixture(scope="session")
+def strong_model(tmp_path_factory, make_checkpoint):
+    """A model whose answers reach the end of the range: module 1 at full pressure. Not to be changed."""
+    from modsoft.export.write import export
+
+    return export(make_checkpoint(tmp_path_factory.mktemp("strong") / "model.pt", gain=4.0)).path

@@ -58,14 +58,6 @@ def wait_until(true, timeout_s):
         time.sleep(0.05)
 
 
-@pytest.fixture(scope="module")
-def strong_model(tmp_path_factory, make_checkpoint):
-    """A model whose answers reach the end of the range: module 1 at full pressure."""
-    from modsoft.export.write import export
-
-    return export(make_checkpoint(tmp_path_factory.mktemp("strong") / "model.pt", gain=4.0)).path
-
-
 def run(folder, robot, model, steps):
     """A short run; every acceptance apart from its length."""
     wanted = folder / "down.npy"  # a random controller is not held to the limits of a task's name

@@ -24,6 +24,14 @@ BEGIN_S = 30.0  # until the first tick, on a busy machine
 LEAVE_S = 15.0  # a lost board is listened to for 6 s
 
 
+# Makes standard input the terminal of a new session, as a terminal's window does, and becomes the program.
+OWN_TERMINAL = """
+import fcntl, os, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+
+
 class Stand:
     """Context manager: a board, a tracker that sees a robot hanging still, and nothing that moves it.
 
@@ -52,10 +60,15 @@ class Stand:
     def __exit__(self, *told):
         self._exits.close()
 
+    def highest_bar(self):
+        """What the valves are told now, at the most."""
+        return max(self.board.duties(), default=0.0) * self.board.ready["p_full_bar"]
+
     def options(self):
         """What modsoft-runtime has to be told to run on these."""
         tools = [option for path in self.tool_files for option in ("--tool", str(path))]
-        return ["--yes", "--robot", "pneumatic-3", "--port", self.board.port, "--tracker-port", self.tracker_port, *tools]
+        ports = ["--port", self.board.port, "--tracker-port", self.tracker_port]
+        return ["--yes", "--robot", "pneumatic-3", *ports, *tools]
 
 
 class Run:
@@ -64,20 +77,25 @@ class Run:
     program: what is started; a wrapper of it such as `FAULTY` for faults in the process itself.
     """
 
-    def __init__(self, stand, model, folder, *options, task="down", program=(str(SCRIPT),), **how):
+    def __init__(self, stand, model, folder, *options, task="down", program=(str(SCRIPT),), terminal=None, **how):
+        """`terminal`: a file descriptor of what is to be its terminal, where it then says what it has to say."""
         self.stand, self.runs = stand, folder / "runs"
         self.began = len(stand.board.trace)
         command = [*program, *stand.options(), "--model", str(model), "--task", str(task), *options]
+        if terminal is not None:
+            command = [sys.executable, "-c", OWN_TERMINAL, *command]
         self.process = subprocess.Popen(
-            [*command, "--runs-dir", str(self.runs)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE, text=True, errors="replace", start_new_session=True, **how,
+            [*command, "--runs-dir", str(self.runs)], start_new_session=True, text=True, errors="replace",
+            stdin=subprocess.DEVNULL if terminal is None else terminal,
+            stdout=subprocess.DEVNULL if terminal is None else terminal,
+            stderr=subprocess.PIPE if terminal is None else terminal, **how,
         )  # fmt: skip
         self.words = []  # (CLOCK_MONOTONIC ns, line)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self):
-        for line in self.process.stderr:
+        for line in self.process.stderr or ():
             self.words.append((time.monotonic_ns(), line.rstrip("\n")))
 
     def __enter__(self):
@@ -89,7 +107,8 @@ class Run:
             self.process.kill()
         self.process.wait()
         self._reader.join()
-        self.process.stderr.close()
+        if self.process.stderr:
+            self.process.stderr.close()
 
     @property
     def said(self):
