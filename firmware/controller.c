@@ -226,8 +226,7 @@ static void on_clear_fault(struct controller *c, const struct frame *frame) {
   send_status(c);
 }
 
-/* Not inlined: a byte that ends no frame need not pay for the room that the answers take on the stack. */
-__attribute__((noinline)) static void on_frame(struct controller *c, const struct frame *frame, uint32_t now_ms) {
+static void on_frame(struct controller *c, const struct frame *frame, uint32_t now_ms) {
   int16_t expected = protocol_payload_length(frame->type);
   if (expected < 0) {
     refuse(c, frame, NACK_REASON_TYPE);
@@ -329,9 +328,10 @@ void controller_init(struct controller *c, uint32_t boot_id, uint8_t reset_cause
   send_hello(c);
 }
 
-uint8_t controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms) {
+/* Not inlined: a byte that ends no frame need not pay for the room that the answers take on the stack. */
+__attribute__((noinline)) static uint8_t on_delimiter(struct controller *c, uint32_t now_ms) {
   struct frame frame;
-  switch (frame_receive(&c->parser, byte, &frame)) {
+  switch (frame_end(&c->parser, &frame)) {
     case FRAME_GOOD:
       c->rx_good++;
       on_frame(c, &frame, now_ms);
@@ -342,6 +342,14 @@ uint8_t controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms) 
     default:
       return 0;
   }
+}
+
+uint8_t controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms) {
+  if (byte == PROTOCOL_DELIMITER) {
+    return on_delimiter(c, now_ms);
+  }
+  frame_take(&c->parser, byte);
+  return 0;
 }
 
 uint8_t controller_update(struct controller *c, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,

@@ -34,24 +34,37 @@ static void append(struct frame_parser *parser, uint8_t byte) {
   }
 }
 
-/* Not inlined: most bytes end no frame, and need not save the registers that this takes. */
-__attribute__((noinline)) static enum frame_event finish(struct frame_parser *parser, struct frame *frame) {
-  enum frame_event event = FRAME_NONE;
-  if (parser->started) {
-    event = FRAME_BAD;
-    if (!parser->broken && parser->remaining == 0 &&
-        parser->length >= PROTOCOL_HEADER_LENGTH + PROTOCOL_CRC_LENGTH) {
-      uint8_t body = (uint8_t)(parser->length - PROTOCOL_CRC_LENGTH);
-      uint32_t crc;
-      memcpy(&crc, parser->decoded + body, sizeof crc);
-      if (crc == frame_crc32(parser->decoded, body)) {
-        frame->type = parser->decoded[0];
-        frame->seq = parser->decoded[1];
-        frame->session = parser->decoded[2];
-        frame->length = (uint8_t)(body - PROTOCOL_HEADER_LENGTH);
-        frame->payload = parser->decoded + PROTOCOL_HEADER_LENGTH;
-        event = FRAME_GOOD;
-      }
+void frame_take(struct frame_parser *parser, uint8_t byte) {
+  parser->started = 1;
+  if (parser->broken) {
+    return;
+  }
+  if (parser->remaining > 0) {
+    append(parser, byte);
+    parser->remaining--;
+    return;
+  }
+  /* A code byte: a run of byte - 1 follows. Runs of 254, which no zero ends, are longer than any frame. */
+  if (parser->zero_pending) {
+    append(parser, 0);
+  }
+  parser->remaining = (uint8_t)(byte - 1);
+  parser->zero_pending = 1;
+}
+
+enum frame_event frame_end(struct frame_parser *parser, struct frame *frame) {
+  enum frame_event event = parser->started ? FRAME_BAD : FRAME_NONE;
+  if (!parser->broken && parser->remaining == 0 && parser->length >= PROTOCOL_HEADER_LENGTH + PROTOCOL_CRC_LENGTH) {
+    uint8_t body = (uint8_t)(parser->length - PROTOCOL_CRC_LENGTH);
+    uint32_t crc;
+    memcpy(&crc, parser->decoded + body, sizeof crc);
+    if (crc == frame_crc32(parser->decoded, body)) {
+      frame->type = parser->decoded[0];
+      frame->seq = parser->decoded[1];
+      frame->session = parser->decoded[2];
+      frame->length = (uint8_t)(body - PROTOCOL_HEADER_LENGTH);
+      frame->payload = parser->decoded + PROTOCOL_HEADER_LENGTH;
+      event = FRAME_GOOD;
     }
   }
   parser->length = 0;
@@ -60,28 +73,6 @@ __attribute__((noinline)) static enum frame_event finish(struct frame_parser *pa
   parser->started = 0;
   parser->broken = 0;
   return event;
-}
-
-enum frame_event frame_receive(struct frame_parser *parser, uint8_t byte, struct frame *frame) {
-  if (byte == PROTOCOL_DELIMITER) {
-    return finish(parser, frame);
-  }
-  parser->started = 1;
-  if (parser->broken) {
-    return FRAME_NONE;
-  }
-  if (parser->remaining > 0) {
-    append(parser, byte);
-    parser->remaining--;
-    return FRAME_NONE;
-  }
-  /* A code byte: a run of byte - 1 follows. Runs of 254, which no zero ends, are longer than any frame. */
-  if (parser->zero_pending) {
-    append(parser, 0);
-  }
-  parser->remaining = (uint8_t)(byte - 1);
-  parser->zero_pending = 1;
-  return FRAME_NONE;
 }
 
 uint8_t frame_encode(uint8_t *encoded, uint8_t type, uint8_t seq, uint8_t session, const void *payload,

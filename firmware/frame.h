@@ -30,8 +30,11 @@ struct frame_parser {
   uint8_t decoded[PROTOCOL_MAX_DECODED];
 };
 
-/* Takes one byte. FRAME_GOOD: *frame is set. FRAME_BAD: something ended that was no frame. */
-enum frame_event frame_receive(struct frame_parser *parser, uint8_t byte, struct frame *frame);
+/* A byte has come that is not the delimiter. */
+void frame_take(struct frame_parser *parser, uint8_t byte);
+
+/* The delimiter has come. FRAME_GOOD: *frame is set. FRAME_BAD: something ended that was no frame. */
+enum frame_event frame_end(struct frame_parser *parser, struct frame *frame);
 
 /* Result of frame_encode for a payload of this length: both delimiters, the COBS code byte (bodies are shorter than the
  * 254 bytes that would need a second one), header and CRC. */

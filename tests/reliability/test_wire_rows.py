@@ -6,6 +6,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from storm_on_mega import Storm
+
+from modsoft.hil import emulator
+from modsoft.runtime.protocol import State
 
 ROOT = Path(__file__).resolve().parents[2]
 TEN_TO_THE_8 = 100_000_000
@@ -71,3 +75,37 @@ def test_row_03_garbage_frames(corrupt, matrix_row, full):
 
 def test_row_04_duplicated_reordered_replayed(corrupt, matrix_row, full):
     tell(matrix_row, 4, "duplicated, reordered, replayed", corrupt("repeat", TEN_TO_THE_8 if full else 100_000))
+
+
+# ---- The compiled firmware on the emulated board
+
+
+@pytest.mark.parametrize(
+    ("row", "kind", "fault", "tries", "full_tries"),
+    [
+        pytest.param(1, "flip", "bit flips", 10_000, 1_000_000, id="test_row_01"),
+        pytest.param(2, "drop", "dropped bytes", 1000, 1_000_000, id="test_row_02_drop"),
+        pytest.param(2, "insert", "inserted bytes", 1000, 1_000_000, id="test_row_02_insert"),
+        pytest.param(3, "truncate", "truncated frame", 1000, 1_000_000, id="test_row_03"),
+        pytest.param(4, "repeat", "duplicated, reordered, replayed", 300, 10_000, id="test_row_04"),
+    ],
+)
+def test_rows_01_to_04_on_the_emulated_board(matrix_row, full, row, kind, fault, tries, full_tries):
+    if missing := emulator.missing_packages("simavr"):
+        pytest.skip(f"simavr needs Debian packages: {' '.join(missing)}")
+    tries = full_tries if full else tries
+    with Storm() as storm:
+        if kind == "repeat":
+            storm.send_repeated(tries)
+        else:
+            storm.send(kind, tries)
+        found = storm.judge()
+    matrix_row(
+        row,
+        fault=f"{fault}, emulated",
+        tries=tries,
+        limit="0 applied, next good frame accepted, no valve moves",
+        worst=f"{found['taken']} frames too many or too few taken, {len(found['moved'])} movements of valves",
+        clock="none",
+    )
+    assert found == {"taken": 0, "refused": 0, "moved": [], "state": State.RUNNING}
