@@ -56,13 +56,13 @@ STAGES = [
         DATA,
         [f"runtime/robots/{ROBOT}.toml", "training/fleet*.[ch]", *SHARED]
         + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "collect")]
-        + [f"training/{name}.py" for name in ("dataset", "shards", "backends")],
+        + [f"training/{name}.py" for name in ("dataset", "hdf5", "shards", "backends")],
     ),
     Stage(
         "train the biLSTM controller",
         ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--minutes", "3.5"],
         CHECKPOINT,
-        [str(DATA)] + [f"training/{name}.py" for name in ("train", "dataset", "networks", "checkpoint")] + SHARED,
+        [str(DATA)] + [f"training/{name}.py" for name in ("train", "dataset", "hdf5", "networks", "checkpoint")] + SHARED,
     ),
     Stage(
         "export it and compare it with torch",

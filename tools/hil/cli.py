@@ -12,11 +12,13 @@ import click
 
 from modsoft.runtime.command import entry
 from modsoft.runtime.controller import Controller
+from modsoft.runtime.errors import OutputError, UsageError
 from modsoft.runtime.trajectory import load_task
 
 RUN_SLACK_S = 60.0  # start, arming, venting and closing of the runtime, beyond its ticks
 AFTER_S = 1.5  # the trace goes on for so long, until the chambers are empty
-RUN_FILES = ("run.jsonl", "meta.json")  # of the runtime's log
+RUNS = "runs"  # the rig's folder for the runtime's logs
+RUN_FILES = ("run.jsonl", "meta.json")  # of such a log
 WRITTEN = (*RUN_FILES, "board.jsonl", "plant.jsonl", "runtime.out", "runtime.err", "report.md", "report.json",
            "angles.png")  # fmt: skip
 
@@ -25,7 +27,8 @@ WRITTEN = (*RUN_FILES, "board.jsonl", "plant.jsonl", "runtime.out", "runtime.err
 @click.option("--robot", "robot_file", required=True, help="Robot file, or a shipped robot's name (pneumatic-3, ...).")
 @click.option("--model", required=True, type=click.Path(path_type=Path), help="Controller of modsoft-export.")
 @click.option("--task", required=True, help="Task's name (edge, down), or a .npy file of desired configurations.")
-@click.option("--report", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder to write.")
+@click.option("--report", required=True, type=click.Path(path_type=Path, file_okay=False),
+              help="Folder to write; one that holds a report already is refused.")  # fmt: skip
 @click.option("--board", default="auto", type=click.Choice(["auto", "simavr", "native"]),
               help="simavr: the compiled firmware on an emulated ATmega2560. native: its logic compiled for this "
                    "machine. auto: simavr where it can be had.")  # fmt: skip
@@ -46,6 +49,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
 
     The folder gets report.md, report.json, angles.png, run.jsonl (the runtime's log), board.jsonl (timer registers of
     the emulated board) and plant.jsonl (the simulated robot). Nothing else should keep the processor busy meanwhile.
+    A run that is interrupted leaves its traces there and no report; the next one into the folder replaces them.
     """
     from tqdm import tqdm
 
@@ -55,6 +59,8 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     from modsoft.hil.plant import load_robot
     from modsoft.hil.rig import Rig
 
+    if (report / reports.FINISHED).exists():
+        raise UsageError(f"{report}: holds the report of a run already; give another --report, or delete it")
     robot = load_robot(robot_file)
     desired = load_task(task, robot)
     Controller.load(model).check(robot)  # the runtime does it too; here it saves the start of the rig
@@ -62,20 +68,19 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     count = len(asked)
     build(choose(board))
 
-    report.mkdir(parents=True, exist_ok=True)
-    for name in WRITTEN:  # whatever is found there afterwards is of this run
-        (report / name).unlink(missing_ok=True)
+    _clear(report)
     options = [] if steps is None else ["--steps", str(steps)]
-    with Rig(robot_file, report, board) as rig:
-        rig.run(model, task, *options)
-        with tqdm(total=count, unit=" ticks", desc="run", disable=not sys.stderr.isatty()) as bar:
-            rig.wait(count * robot.loop.period_s + RUN_SLACK_S, lambda ticks: bar.update(ticks - bar.n))
-        rig.settle(AFTER_S)
-    if run := rig.run_folder():
-        for name in RUN_FILES:
-            shutil.move(run / name, report / name)
-        shutil.rmtree(rig.runs)
-    found = record.read(report, report if run else None, robot, task, asked, rig.runtime.returncode)
+    rig = Rig(robot_file, report, board)
+    try:
+        with rig:
+            rig.run(model, task, *options)
+            with tqdm(total=count, unit=" ticks", desc="run", disable=not sys.stderr.isatty()) as bar:
+                rig.wait(count * robot.loop.period_s + RUN_SLACK_S, lambda ticks: bar.update(ticks - bar.n))
+            rig.settle(AFTER_S)
+    finally:
+        ran = _move_log(rig.run_folder(), report)
+        shutil.rmtree(report / RUNS, ignore_errors=True)
+    found = record.read(report, report if ran else None, robot, task, asked, rig.runtime.returncode)
     verdict = judge.judge(found)
     about = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -96,6 +101,26 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     click.echo(f"{verdict}\n{report / 'report.md'}")
     # a run that never began is judged by what the runtime said, not by the figures it could not have
     return found.runtime_exit if found.runtime_exit and not len(found.tick) else verdict.exit_code
+
+
+def _clear(report: Path) -> None:
+    """Makes the folder; whatever is found there afterwards is of this run."""
+    try:
+        report.mkdir(parents=True, exist_ok=True)
+        for name in WRITTEN:
+            (report / name).unlink(missing_ok=True)
+        shutil.rmtree(report / RUNS, ignore_errors=True)
+    except OSError as error:
+        raise OutputError(f"{report}: cannot be written ({error.strerror}); choose another --report") from error
+
+
+def _move_log(run: Path | None, report: Path) -> bool:
+    """Moves the runtime's log beside the other traces; whether there was one."""
+    if run is None:
+        return False
+    for name in RUN_FILES:
+        shutil.move(run / name, report / name)
+    return True
 
 
 main = entry(cli)

@@ -14,8 +14,10 @@ from modsoft.hil.judge import Acceptance, Verdict, measured_off_deg, tracking_er
 from modsoft.hil.record import Record
 from modsoft.hil.valves import valve_difference
 from modsoft.runtime.configuration import angle_between_deg, bending_angle_deg
+from modsoft.runtime.files import written
 from modsoft.runtime.tally import spread
 
+FINISHED = "report.json"
 CLOCKS = (
     "Tick lateness and acknowledgement times: the host's CLOCK_MONOTONIC, taken by modsoft-runtime. Valve outputs: the "
     "emulated board's timer registers (native board: what its logic asks for), stamped with its cycle counter and, for "
@@ -56,7 +58,8 @@ def figures(record: Record) -> dict[str, Any]:
 
 
 def write(record: Record, verdict: Verdict, about: dict[str, str], folder: Path) -> None:
-    """Writes the three files into `folder`. `about` says what ran, in the order it is shown."""
+    """Writes the three files into `folder`, report.json last: where it is, the others are. `about` says what ran, in
+    the order it is shown."""
     found = figures(record)
     table = [line._asdict() for line in [*verdict.acceptances, *verdict.witnesses]]
     document = {
@@ -66,10 +69,13 @@ def write(record: Record, verdict: Verdict, about: dict[str, str], folder: Path)
         "acceptances": table,
         "figures": found,
     }
-    (folder / "report.json").write_text(json.dumps(_plain(document), indent=1) + "\n", encoding="utf-8")
-    (folder / "report.md").write_text(text(record, verdict, about, found), encoding="utf-8")
     if len(record.tick):
-        picture(record).savefig(folder / "angles.png", dpi=110)
+        with written(folder / "angles.png") as temporary:
+            picture(record).savefig(temporary, dpi=110, format="png")
+    with written(folder / "report.md") as temporary:
+        temporary.write_text(text(record, verdict, about, found), encoding="utf-8")
+    with written(folder / FINISHED) as temporary:
+        temporary.write_text(json.dumps(_plain(document), indent=1) + "\n", encoding="utf-8")
 
 
 def text(record: Record, verdict: Verdict, about: dict[str, str], found: dict[str, Any]) -> str:
@@ -147,8 +153,9 @@ def picture(record: Record) -> Figure:
         for side, colour in (("+", "#2ca02c"), ("-", "#9467bd")):
             commanded = record.commanded_bar[:, channels[f"{module + 1}{side}"]]
             inside = record.plant_bar[:, module, "+-".index(side)]
-            below.step(at_tick, commanded, where="post", color=colour, lw=1.4, label=f"chamber {side}, commanded")
-            below.plot(at_slice, inside, color=colour, lw=0.9, alpha=0.5, label=f"chamber {side}, inside")
+            # Inside and commanded differ little: a broad light band, and the thin line on it.
+            below.plot(at_slice, inside, color=colour, lw=5.0, alpha=0.3, label=f"chamber {side}, inside")
+            below.step(at_tick, commanded, where="post", color=colour, lw=1.1, label=f"chamber {side}, commanded")
         below.set_xlabel("time, s")
         below.grid(alpha=0.3)
         below.set_xlim(-1.0, at_tick[-1] + 2.0)
