@@ -62,7 +62,8 @@ STAGES = [
         "train the biLSTM controller",
         ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--minutes", "3.5"],
         CHECKPOINT,
-        [str(DATA)] + [f"training/{name}.py" for name in ("train", "dataset", "hdf5", "networks", "checkpoint")] + SHARED,
+        [str(DATA), *SHARED]
+        + [f"training/{name}.py" for name in ("train", "dataset", "hdf5", "networks", "checkpoint")],
     ),
     Stage(
         "export it and compare it with torch",
