@@ -40,6 +40,7 @@ CAUSES = {
     "exception": (by_signal(signal.SIGUSR1), 70, True),
     "tracker lost": (tracker(unplug=True), 74, True),
     "board lost": (board("unplug"), 74, False),
+    "board restarts": (board("reset"), 74, True),
 }
 
 
@@ -75,6 +76,8 @@ def test_row_12_every_way_out_vents(matrix_row, full, model_file, tmp_path):
             assert end["vented"] == log.meta["vented"] == can_say, run.said
             [said_ns] = [at_ns for at_ns, line in run.words if line.startswith("valves vented")]
             assert (VENTED in run.said, UNKNOWN in run.said) == (can_say, not can_say)
+            assert log.meta["reason"] in run.said
+            assert run.words[-1][1].startswith("modsoft-runtime: ")
             if can_say:
                 assert closed_ns < end["vented_ns"] < said_ns < left_ns
             return name, (closed_ns - began_ns) * 1e-9 if closed_ns else None, (left_ns - began_ns) * 1e-9
@@ -92,7 +95,7 @@ def test_row_12_every_way_out_vents(matrix_row, full, model_file, tmp_path):
 
 def test_row_12_nobody_says_vented_for_a_board_that_is_not_heard(matrix_row, model_file, tmp_path):
     """The line from the board is cut just before: it vents as it should, but its word never comes."""
-    names = [name for name, (_, _, can_say) in CAUSES.items() if can_say]
+    names = ["SIGINT", "SIGTERM", "SIGHUP", "exception", "tracker lost", "board restarts"]
 
     def attempt(number):
         cause, code, _ = CAUSES[names[number]]
