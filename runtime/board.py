@@ -53,6 +53,7 @@ class Port(Protocol):
     @property
     def in_waiting(self) -> int: ...
     def read(self, size: int = 1) -> bytes: ...
+    def cancel_read(self) -> None: ...
     def write(self, data: bytes) -> int | None: ...
     def open(self) -> None: ...
     def close(self) -> None: ...
@@ -209,7 +210,9 @@ class Board:
             raise Tripped(f"set-points {pressures.tolist()} bar leave the range from 0 to {to_bar(self._p_max):g} bar")
         padded = tuple(units.tolist()) + (0,) * (CHANNELS - len(units))
         with self._changed:
-            return self._link.set(Set(tick & 0xFFFFFFFF, padded))
+            sequence = self._link.set(Set(tick & 0xFFFFFFFF, padded))
+        self._wake()
+        return sequence
 
     def beat(self, tick: int) -> None:
         """Publish the control loop's counter on a tick that sends no set-points."""
@@ -225,6 +228,7 @@ class Board:
         with self._changed:
             if self._link.phase is Phase.READY:
                 self._link.vent(mode)
+                self._wake()
         if self._link.phase is Phase.READY:
             self._wait(lambda: self._said_vented(since), self._clock() + timeout_s)
         if self._link.phase is Phase.LOST:
@@ -300,6 +304,11 @@ class Board:
     @property
     def _closed(self) -> bool:
         return self._stop.is_set() or (self._thread is not None and not self._thread.is_alive())
+
+    def _wake(self) -> None:
+        """The thread of the port may sleep in a read; what was asked for is to go out now."""
+        if self._thread is not None and not self._closed:
+            self._port.cancel_read()
 
     def _wait(self, condition: Callable[[], bool], deadline: float) -> None:
         """Until `condition`, the loss of the board, or the deadline."""

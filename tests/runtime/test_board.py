@@ -48,6 +48,9 @@ class ScriptedPort:
         self.written += len(data)
         return len(data)
 
+    def cancel_read(self):
+        pass
+
     def open(self):
         raise AssertionError("never opened twice")
 
@@ -98,6 +101,45 @@ def test_port_that_fails_before_hello():
     with pytest.raises(DeviceAbsent, match="the port failed"):
         Board(port)
     assert port.closed
+
+
+class SleepyPort(ScriptedPort):
+    """A board that has said all it had to say: whoever reads sleeps for long, unless somebody cancels that."""
+
+    LONG_S = 30.0
+
+    def __init__(self):
+        super().__init__()
+        self.reads = 0
+        self.asleep, self.woken, self.sent = threading.Event(), threading.Event(), threading.Event()
+
+    def read(self, size=1):
+        self.reads += 1
+        if self.reads <= 2:
+            return super().read(size)
+        self.asleep.set()
+        self.woken.wait(self.LONG_S)
+        self.woken.clear()
+        return b""
+
+    def cancel_read(self):
+        self.woken.set()
+
+    def write(self, data):
+        if len(data) >= len(protocol.encode(protocol.Set(0, (0,) * CHANNELS))):
+            self.sent.set()
+        return super().write(data)
+
+
+def test_set_points_do_not_wait_for_the_end_of_a_read():
+    port = SleepyPort()
+    board = Board(port)
+    try:
+        assert port.asleep.wait(5.0)
+        board.set_pressures(1, [0.0])
+        assert port.sent.wait(5.0), "the thread of the port slept on"
+    finally:
+        board._shut()
 
 
 class ArmedPort(ScriptedPort):
