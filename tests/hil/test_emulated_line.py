@@ -50,6 +50,7 @@ def test_a_host_that_talks_at_once_stays_in_the_bootloader() -> None:
         silent_s = wait_for_hello(port, 8)[1]
         print(f"out of the bootloader after {silent_s:.2f} s of silence")
         assert 4 < silent_s < 5.5
+    assert board.summary["rx_bootloader"] == 7 * len(encode(HelloReq(PROTOCOL_HASH)))
 
 
 def test_every_open_resets_and_is_told_apart(board_name: str) -> None:
