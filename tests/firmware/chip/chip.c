@@ -1,0 +1,7 @@
+/* What pwm.c, sensors.c and boot.c touch of the chip and of the Arduino core, as plain memory. */
+#include <avr/io.h>
+#include <avr/wdt.h>
+
+_Alignas(2) volatile uint8_t chip[0x200];
+int watchdog_is_on = 1, watchdog_resets;
+volatile unsigned long timer0_millis;

@@ -1,0 +1,214 @@
+"""pwm.c, sensors.c and boot.c on a chip of plain memory. Register addresses are those of the ATmega2560's data sheet,
+"Register Summary"."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import zlib
+from pathlib import Path
+
+import pytest
+
+from modsoft.runtime.protocol import CHANNELS, NOT_MEASURED, ResetCause
+
+FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
+TIMERS = {1: 0x80, 3: 0x90, 4: 0xA0, 5: 0x120}  # TCCRnA; TCCRnB, TCNTn, ICRn and OCRnA to C follow
+PORTS = {"B": 0x25, "E": 0x2E, "H": 0x102, "L": 0x10B}  # PORTx, DDRx before it
+ADCL, ADCSRA, ADMUX, DIDR0, MCUSR = 0x78, 0x7A, 0x7C, 0x7E, 0x54
+CONVERTING = 1 << 6
+TOP = 4095
+
+
+class Sensors(ctypes.Structure):
+    _fields_ = [
+        ("measured", ctypes.c_int16 * CHANNELS),
+        ("supply_mv", ctypes.c_uint16),
+        ("input", ctypes.c_uint8),
+        ("rounds", ctypes.c_uint8),
+    ]
+
+
+class Chip:
+    """A chip just powered on: a copy of the library has memory of its own."""
+
+    def __init__(self, library: Path) -> None:
+        self.code = ctypes.CDLL(str(library))
+        self.code.boot_next_id.restype = ctypes.c_uint32
+        self.code.boot_reset_cause.restype = ctypes.c_uint8
+        self.registers = (ctypes.c_uint8 * 0x200).in_dll(self.code, "chip")
+        self.millis = ctypes.c_ulong.in_dll(self.code, "timer0_millis")
+        self.watchdog_is_on = ctypes.c_int.in_dll(self.code, "watchdog_is_on")
+        self.watchdog_resets = ctypes.c_int.in_dll(self.code, "watchdog_resets")
+
+    def word(self, address: int) -> int:
+        return self.registers[address] | self.registers[address + 1] << 8
+
+    def boot(self, flags: int = 0) -> tuple[int, ResetCause]:
+        self.registers[MCUSR] = flags
+        self.code.boot_early()
+        return self.code.boot_next_id(), ResetCause(self.code.boot_reset_cause())
+
+
+@pytest.fixture
+def chip(native, tmp_path):
+    if not (native / "libchip.so").exists():
+        pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
+    return Chip(shutil.copy(native / "libchip.so", tmp_path))
+
+
+# ---- PWM
+
+
+@pytest.fixture
+def outputs():
+    """(timer, compare unit, port, bit) of each channel, as pins.h says."""
+    rows = re.findall(r"X\(\d+, \d+, (\d), ([ABC]), ([A-L]), (\d)\)", (FIRMWARE / "pins.h").read_text())
+    return [(TIMERS[int(timer)], "ABC".index(unit), PORTS[port], int(bit)) for timer, unit, port, bit in rows]
+
+
+def test_pins_are_low_before_they_become_outputs_and_nothing_is_connected(chip, outputs):
+    for port in PORTS.values():
+        chip.registers[port] = 0xFF
+    chip.code.pwm_begin()
+    for timer in TIMERS.values():
+        assert chip.registers[timer] == 0b10  # nothing connected; mode 14, fast PWM up to ICRn, over both registers
+        assert chip.registers[timer + 1] == 0b11001  # no prescaler
+        assert chip.word(timer + 6) == TOP
+    for channel, (_, _, port, bit) in enumerate(outputs):
+        used = channel < 11
+        assert chip.registers[port] >> bit & 1 == (not used)
+        assert chip.registers[port - 1] >> bit & 1 == used
+    assert sum(bin(chip.registers[port - 1]).count("1") for port in PORTS.values()) == 11  # no other pin
+
+
+@pytest.mark.parametrize("channel", range(11))
+def test_counts_reach_the_register_of_their_pin_and_no_other(chip, outputs, channel):
+    chip.code.pwm_begin()
+    timer, unit, _, _ = outputs[channel]
+    before = bytes(chip.registers)
+    for counts in (1, 478, 4096):
+        chip.code.pwm_write(channel, counts)
+        assert chip.word(timer + 8 + 2 * unit) == counts - 1
+        assert chip.registers[timer] == 0b10 | 0b10 << (6 - 2 * unit)  # connected, not inverted
+    chip.code.pwm_write(channel, 0)
+    assert bytes(chip.registers) == before
+
+
+def test_the_bootloaders_pin_is_left_alone(chip):
+    chip.code.pwm_begin()
+    before = bytes(chip.registers)
+    for channel in (11, 12, 255):
+        chip.code.pwm_write(channel, 100)
+    assert bytes(chip.registers) == before
+
+
+# ---- sensors
+
+
+def convert(chip, sensors, reading):
+    """One conversion ends; returns what was being measured."""
+    source = chip.registers[ADMUX]
+    chip.registers[ADCL], chip.registers[ADCL + 1] = reading & 0xFF, reading >> 8
+    chip.registers[ADCSRA] &= ~CONVERTING
+    chip.code.sensors_poll(ctypes.byref(sensors))
+    return source
+
+
+def begin(chip):
+    sensors = Sensors()
+    chip.code.sensors_begin(ctypes.byref(sensors))
+    return sensors
+
+
+REFERENCE = 0b01_0_11110  # the 1.1 V reference, against the supply
+
+
+def test_nothing_is_measured_before_its_first_reading(chip):
+    sensors = begin(chip)
+    assert list(sensors.measured) == [NOT_MEASURED] * 12
+    assert sensors.supply_mv == 0
+    assert chip.registers[DIDR0] == 0x3F
+    assert chip.registers[ADCSRA] == 0b1_1_000_111  # on, started, 125 kHz
+
+
+def test_a_conversion_is_never_waited_for(chip):
+    sensors = begin(chip)
+    before = bytes(sensors)
+    chip.code.sensors_poll(ctypes.byref(sensors))
+    assert bytes(sensors) == before
+
+
+def test_supply_first_then_64_rounds_of_all_sensors(chip):
+    sensors = begin(chip)
+    sources = [convert(chip, sensors, 225) for _ in range(2 + 64 * 6 + 2 + 6)]
+    rounds = [0b01_0_00000 | channel for channel in range(6)]
+    assert sources == [REFERENCE] * 2 + rounds * 64 + [REFERENCE] * 2 + rounds
+    assert chip.registers[ADCSRA] & CONVERTING
+
+
+def test_supply_voltage(chip):
+    sensors = begin(chip)
+    convert(chip, sensors, 1)
+    assert sensors.supply_mv == 0  # the first one is not settled
+    convert(chip, sensors, 225)
+    assert sensors.supply_mv == 1100 * 1024 // 225
+    for _ in range(64 * 6 + 1):
+        convert(chip, sensors, 225)
+    convert(chip, sensors, 0)
+    assert sensors.supply_mv == 0
+
+
+def test_pressures(chip):
+    sensors = begin(chip)
+    for _ in range(2):
+        convert(chip, sensors, 225)
+    for reading in (0, 1, 102, 512, 1022, 1023):
+        convert(chip, sensors, reading)
+    assert list(sensors.measured) == [0, 10, 996, 5000, 9980, 9990] + [NOT_MEASURED] * 6
+
+
+# ---- reset
+
+
+def test_power_on_makes_an_id_of_chance_and_every_reset_after_it_the_next(chip):
+    first, cause = chip.boot()
+    assert cause == ResetCause.POWER_ON
+    assert first == zlib.crc32(bytes(36))  # all of the memory that a reset leaves alone
+    assert [chip.boot() for _ in range(3)] == [(first + n, ResetCause.EXTERNAL) for n in (1, 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("flags", "cause"),
+    [
+        (0b1000, ResetCause.WATCHDOG),
+        (0b0100, ResetCause.BROWN_OUT),
+        (0b0001, ResetCause.POWER_ON),
+        (0b0010, ResetCause.EXTERNAL),
+        (0b1111, ResetCause.WATCHDOG),
+        (0b0111, ResetCause.BROWN_OUT),
+        (0b0011, ResetCause.POWER_ON),
+    ],
+)
+def test_the_chips_own_flags_are_believed(chip, flags, cause):
+    chip.boot()
+    assert chip.boot(flags)[1] == cause
+    assert chip.registers[MCUSR] == 0, "they would be there still after the next reset"
+
+
+@pytest.mark.parametrize(("hung_ms", "cause"), [(99, ResetCause.EXTERNAL), (100, ResetCause.WATCHDOG)])
+def test_behind_the_bootloader_a_starved_watchdog_is_told_by_the_clock(chip, hung_ms, cause):
+    chip.boot()
+    chip.code.boot_feed_watchdog(5000)
+    chip.millis.value = 5000 + hung_ms
+    assert chip.boot()[1] == cause
+    chip.millis.value = 0
+    assert chip.boot()[1] == ResetCause.EXTERNAL, "the last feeding of the run before is forgotten"
+
+
+def test_watchdog_is_off_until_setup_and_fed_by_feeding(chip):
+    chip.boot()
+    assert chip.watchdog_is_on.value == 0
+    chip.code.boot_feed_watchdog(1)
+    assert chip.watchdog_resets.value == 1
