@@ -1,6 +1,7 @@
 """What the attacks share. Every file is a real one: where that can be shown, it does its harm to a careless reader."""
 
 import os
+import sys
 
 import pytest
 
@@ -42,3 +43,16 @@ def refused():
         assert "allow_pickle" not in str(told.value)
 
     return check
+
+
+@pytest.fixture
+def ended(monkeypatch, capfd):
+    """ended(main, *arguments) runs a console script's function: (exit code, lines of standard error)."""
+
+    def run(main, *arguments):
+        monkeypatch.setattr(sys, "argv", ["command", *map(str, arguments)])
+        with pytest.raises(SystemExit) as told:
+            main()
+        return told.value.code, capfd.readouterr().err.splitlines()
+
+    return run

@@ -6,6 +6,7 @@ import zipfile
 import pytest
 import torch
 
+from modsoft.export import cli as export_cli
 from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
 
@@ -23,6 +24,14 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path, mark, evil, make_checkpoint, 
     torch.save({**checkpoints.load(path), place: evil}, path, _use_new_zipfile_serialization=zipped)
     refused(checkpoints.load, path, "not a checkpoint of modsoft-train")
     assert not mark.exists()
+
+
+def test_modsoft_export_ends_with_65(tmp_path, mark, evil, make_checkpoint, ended):
+    path = make_checkpoint(tmp_path / "model.pt")
+    torch.save({**checkpoints.load(path), "extra": evil}, path)
+    code, said = ended(export_cli.main, path)
+    assert (code, len(said)) == (65, 1)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")

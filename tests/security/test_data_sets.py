@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
-from modsoft.training import dataset
+from modsoft.training import collect_cli, dataset, simulate, train_cli
 
 
 @pytest.fixture
@@ -85,6 +85,29 @@ def test_a_data_set_that_points_elsewhere_or_claims_too_much(tmp_path, data_file
             assert file["action"][()].shape == (2, 3, 2, 1), "whoever does not look follows it"
     refused(dataset.read, data_file, says)
     refused(dataset.read_header, data_file, says)
+
+
+@pytest.mark.parametrize(
+    ("main", "before", "after"),
+    [(train_cli.main, [], ["--out", "model.pt"]), (collect_cli.main, ["plot"], ["--out", "picture.png"])],
+)
+def test_the_commands_end_with_65(tmp_path, monkeypatch, data_file, main, before, after, ended):
+    monkeypatch.chdir(tmp_path)
+    with h5py.File(data_file, "r+") as file:
+        del file["action"]
+        linked(file, other_file(tmp_path))
+    before_it = set(tmp_path.iterdir())
+    code, said = ended(main, *before, data_file, *after)
+    assert (code, len(said)) == (65, 1)
+    assert set(tmp_path.iterdir()) == before_it
+
+
+def test_actions_that_are_a_pickle_end_modsoft_simulate_with_65(tmp_path, mark, evil, ended):
+    np.save(tmp_path / "a.npy", np.array([[[evil]]]), allow_pickle=True)
+    order = ["--robot", "pneumatic-2", "--actions", tmp_path / "a.npy", "--out", tmp_path / "o"]
+    code, said = ended(simulate.main, *order)
+    assert (code, len(said)) == (65, 1)
+    assert not mark.exists()
 
 
 @pytest.mark.parametrize("recipe", ["", "[]", "{}", '{"robot": 1}', '{"robot": {}}', "[" * 10**5, "null"])

@@ -8,7 +8,10 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 
+from modsoft.export import cli as export_cli
+from modsoft.hil import cli as hil_cli
 from modsoft.runtime import artefact
+from modsoft.runtime import cli as runtime_cli
 from modsoft.runtime.controller import Controller
 
 
@@ -64,6 +67,25 @@ def test_a_model_with_weights_in_another_file(tmp_path, monkeypatch, model_file,
         outside(tensor, location.format(folder=tmp_path, name=tmp_path.name))
     path.write_bytes(resealed(model))
     refused(Controller.load, path, "onnxruntime .* refuses it")
+
+
+@pytest.mark.parametrize(
+    ("main", "before", "after"),
+    [
+        (export_cli.main, ["--inspect"], []),
+        (runtime_cli.main, ["--yes", "--robot", "pneumatic-3", "--task", "down", "--port", os.devnull, "--model"], []),
+        (hil_cli.main, ["--robot", "pneumatic-3", "--task", "down", "--model"], ["--report", "out"]),
+    ],
+)
+def test_the_commands_end_with_65(tmp_path, monkeypatch, model_file, main, before, after, ended):
+    monkeypatch.chdir(tmp_path)
+    model, path = onnx.load(model_file), tmp_path / "model.onnx"
+    outside(largest_weight(model), "/etc/hostname")
+    path.write_bytes(resealed(model))
+    before_it = set(tmp_path.iterdir())
+    code, said = ended(main, *before, path, *after)
+    assert (code, len(said)) == (65, 1), said
+    assert set(tmp_path.iterdir()) == before_it
 
 
 def test_a_model_with_weights_at_an_address_of_the_memory(tmp_path, monkeypatch, model_file, refused):

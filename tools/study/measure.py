@@ -107,7 +107,7 @@ def record(**given: Any) -> Record:
 def records(plan: Plan, folder: Folder) -> Iterator[Record]:
     yield from of_the_paper()
     for model in plan.models:
-        with np.load(folder.estimate(model)) as file:
+        with np.load(folder.estimate(model), allow_pickle=False) as file:
             errors = file["error_percent"]  # (W, N, A)
         key = {"table": "1", "quantity": ESTIMATION, "source": "study", "modules": errors.shape[1]}
         key |= {"network": model.network, "data": model.data, "split": model.split, "seed": model.seed}

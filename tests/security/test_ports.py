@@ -1,0 +1,104 @@
+"""Nothing that runs here listens where another machine could speak to it."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from modsoft.hil.rig import Rig
+
+LISTENING = "0A"
+# As the kernel writes 127.0.0.1, ::1 and ::ffff:127.0.0.1.
+LOOPBACK = ("0100007F", "00000000000000000000000001000000", "0000000000000000FFFF00000100007F")
+
+
+def below(pid):
+    """The process and all that it started."""
+    found = [pid]
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in task.read_text().split():
+            found += below(int(child))
+    return found
+
+
+def listening(pids):
+    """Addresses ADDRESS:PORT, hexadecimal, on which any of the processes takes connections or packets."""
+    sockets = set()
+    for pid in pids:
+        for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+            try:
+                sockets.add(os.readlink(descriptor))
+            except FileNotFoundError:
+                pass  # closed meanwhile
+    found = set()
+    for kind in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path(f"/proc/net/{kind}").read_text().splitlines()[1:]:
+            _, address, _, state, *_, inode = line.split()[:10]
+            if f"socket:[{inode}]" in sockets and (state == LISTENING or kind.startswith("udp")):
+                found.add(address)
+    return found
+
+
+def elsewhere(addresses):
+    return {address for address in addresses if address.partition(":")[0] not in LOOPBACK}
+
+
+def test_a_port_for_everybody_is_seen():
+    script = "import socket, sys; s = socket.create_server(('', 0)); print('ready', flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as server:
+        assert server.stdout.readline() == "ready\n"
+        assert len(elsewhere(listening(below(server.pid)))) == 1
+        server.stdin.close()
+
+
+@pytest.mark.realtime
+def test_a_run_on_the_rig_listens_nowhere(tmp_path, model_file):
+    with Rig("pneumatic-3", tmp_path, board="native") as rig:
+        rig.run(model_file, "down")
+        deadline_s = time.monotonic() + 60
+        while not rig.ticks() and rig.runtime.poll() is None and time.monotonic() < deadline_s:
+            time.sleep(0.1)
+        running = below(os.getpid())
+        assert rig.runtime.pid in running
+        assert len(running) >= 5, "this, board, tracker, robot, runtime"
+        assert listening(running) == set()
+
+
+DASK = """
+import json, sys
+from pathlib import Path
+from modsoft.training import backends
+
+if __name__ == "__main__":
+    with backends.by_dask(1, Path("."), json.loads(sys.argv[1])):
+        print("ready", flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "open_to_others"),
+    [("{}", 0), ('{"cluster": "SLURMCluster", "cores": 1, "memory": "1GB"}', 1)],
+    ids=["local", "cluster"],
+)
+def test_dask_listens_to_this_machine_or_to_its_workers_alone(tmp_path, options, open_to_others):
+    """A cluster's workers reach the scheduler's one port; its dashboard and everything of a local one stay here."""
+    pytest.importorskip("dask_jobqueue", reason="extra dask")
+    (tmp_path / "sbatch").write_text("#!/bin/sh\necho Submitted batch job 1\n")
+    (tmp_path / "sbatch").chmod(0o755)
+    (tmp_path / "scancel").symlink_to("/bin/true")
+    (tmp_path / "script.py").write_text(DASK)
+    with subprocess.Popen(
+        [sys.executable, "script.py", options], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"},
+    ) as dask:  # fmt: skip
+        assert dask.stdout.readline() == "ready\n"
+        found = listening(below(dask.pid))
+        dask.stdin.close()
+    assert len(found) >= 2
+    assert len({address.rpartition(":")[2] for address in elsewhere(found)}) == open_to_others

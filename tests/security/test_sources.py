@@ -1,0 +1,105 @@
+"""No source reads a file in a way that could run what is in it, or listens where another machine could speak."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FOLDERS = ("runtime", "training", "export", "tools")
+# What runs code out of files, or serves the network.
+MODULES = {"cloudpickle", "dill", "http", "joblib", "marshal", "shelve", "socketserver", "tarfile", "xmlrpc", "yaml"}
+BUILT_IN = {"eval", "exec", "compile", "__import__"}
+CALLS = {"system", "popen", "extract", "extractall", "unpack_archive"}
+CALLS |= {"bind", "listen", "create_server", "start_server", "serve_forever"}
+NEEDED = {
+    "torch.load": ("weights_only", True),
+    "np.load": ("allow_pickle", False),
+    "np.fromfile": ("", None),  # no argument makes it a reader that checks
+    "onnx.load": ("load_external_data", False),
+}
+# The one place that each of these stands in, where it is told what it may not do.
+ONLY_IN = {"h5py.File": "training/dataset.py", "onnxruntime.InferenceSession": "runtime/controller.py"}
+
+
+def name_of(node):
+    """`a.b` of an expression a.b, `a` of a name."""
+    if isinstance(node, ast.Attribute):
+        return f"{name_of(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def found_in(text, where):
+    """What a source does that none may: one line each."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or ""]
+            for module in modules:
+                if module.partition(".")[0] in MODULES:
+                    yield f"{where}:{node.lineno} imports {module}"
+        if isinstance(node, ast.ImportFrom) and node.module in ("pickle", "torch", "numpy", "onnx", "h5py", "socket"):
+            for alias in node.names:
+                if alias.name in ("load", "loads", "File", "Unpickler", "socket"):
+                    yield f"{where}:{node.lineno} takes {alias.name} out of {node.module}"
+        if isinstance(node, ast.Attribute) and name_of(node) in ("pickle.load", "pickle.loads", "pickle.Unpickler"):
+            yield f"{where}:{node.lineno} unpickles"
+        if isinstance(node, ast.Attribute) and name_of(node) == "socket.socket":
+            yield f"{where}:{node.lineno} opens a socket"
+        if isinstance(node, ast.Call):
+            yield from (f"{where}:{node.lineno} {told}" for told in of_call(node, where))
+
+
+def of_call(node, where):
+    called = name_of(node.func)
+    given = {keyword.arg: getattr(keyword.value, "value", None) for keyword in node.keywords}
+    if called in BUILT_IN or called.rpartition(".")[2] in CALLS:
+        yield f"calls {called}"
+    if given.get("shell"):
+        yield f"gives {called} to a shell"
+    if given.get("allow_pickle") or given.get("weights_only") is False:
+        yield f"{called} may run what it reads"
+    if called in NEEDED and given.get(NEEDED[called][0], "not given") is not NEEDED[called][1]:
+        yield f"{called} without {NEEDED[called][0]}={NEEDED[called][1]}"
+    if called in ONLY_IN and where != ONLY_IN[called]:
+        yield f"{called}, which belongs into {ONLY_IN[called]}"
+
+
+def sources():
+    return sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+
+
+def test_no_source_runs_what_it_reads_or_serves_the_network():
+    assert len(sources()) > 60
+    found = [line for path in sources() for line in found_in(path.read_text(), str(path.relative_to(ROOT)))]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import pickle\npickle.load(file)",
+        "import pickle\nread = pickle.Unpickler(file).load",
+        "from pickle import loads",
+        "import joblib",
+        "from yaml import load",
+        "torch.load(path)",
+        "torch.load(path, weights_only=False)",
+        "torch.load(path, weights_only=safe)",
+        "np.load(path)",
+        "np.load(path, allow_pickle=True)",
+        "np.fromfile(path)",
+        "from numpy import load",
+        "onnx.load(path)",
+        "h5py.File(path)",
+        "onnxruntime.InferenceSession(model)",
+        "eval(text)",
+        "os.system(text)",
+        "subprocess.run(text, shell=True)",
+        "archive.extractall(folder)",
+        "server.bind(address)",
+        "socket.socket()",
+        "import http.server",
+    ],
+)
+def test_each_such_thing_is_found(text):
+    assert list(found_in(text, "somewhere.py"))
