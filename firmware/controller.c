@@ -252,7 +252,7 @@ static void on_frame(struct controller *c, const struct frame *frame, uint32_t n
     case MESSAGE_VENT:
       on_vent(c, frame);
       break;
-    case MESSAGE_CLEAR_FAULT:
+    default: /* MESSAGE_CLEAR_FAULT: every other type has been refused above */
       on_clear_fault(c, frame);
       break;
   }
@@ -274,40 +274,38 @@ static uint8_t check_control(struct controller *c, uint32_t now_ms) {
   return CHECK_CONTROL;
 }
 
-static uint8_t check_sensors(struct controller *c, uint16_t elapsed_ms) {
+/* Counts how long something has been the case; 1 once it has been for limit_ms, and then counts anew. */
+static uint8_t lasts(uint16_t *counted_ms, uint8_t is, uint32_t elapsed_ms, uint16_t limit_ms) {
+  uint32_t lasted_ms = is ? *counted_ms + elapsed_ms : 0;
+  uint8_t too_long = lasted_ms >= limit_ms;
+  *counted_ms = too_long ? 0 : (uint16_t)lasted_ms;
+  return too_long;
+}
+
+static uint8_t check_sensors(struct controller *c, uint32_t elapsed_ms) {
   for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
     int16_t measured = c->measured[channel];
-    int16_t disagree = c->disagree_ms[channel];
     int16_t off;
+    uint8_t driven;
     if (measured == PROTOCOL_NOT_MEASURED) {
       continue;
     }
+    if (lasts(&c->over_ms[channel], measured > P_OVER, elapsed_ms, OVER_PRESSURE_MS)) {
+      latch(c, FAULT_OVER_PRESSURE); /* in any state; and again while it lasts, so that it cannot be cleared */
+    }
     off = (int16_t)(measured - c->output.applied[channel]); /* both lie between 0 and SENSOR_FULL */
-    c->over_ms[channel] = measured > P_OVER ? (uint16_t)(c->over_ms[channel] + elapsed_ms) : 0;
-    if (c->over_ms[channel] >= OVER_PRESSURE_MS) {
-      c->over_ms[channel] = 0; /* counts anew: the latch holds, and must not be cleared while it lasts */
-      latch(c, FAULT_OVER_PRESSURE);
-    }
-    if (c->state != STATE_RUNNING || !((c->channels >> channel) & 1)) {
-      disagree = 0;
-    } else if (off > P_DISAGREE) {
-      disagree = (int16_t)((disagree > 0 ? disagree : 0) + (int16_t)elapsed_ms);
-    } else if (off < -P_DISAGREE) {
-      disagree = (int16_t)((disagree < 0 ? disagree : 0) - (int16_t)elapsed_ms);
-    } else {
-      disagree = 0;
-    }
-    if (disagree >= DISAGREE_MS) {
+    driven = c->state == STATE_RUNNING && ((c->channels >> channel) & 1);
+    if (lasts(&c->above_ms[channel], driven && off > P_DISAGREE, elapsed_ms, DISAGREE_MS)) {
       latch(c, FAULT_SENSOR);
-    } else if (disagree <= -DISAGREE_MS) {
+    }
+    if (lasts(&c->below_ms[channel], driven && off < -P_DISAGREE, elapsed_ms, DISAGREE_MS)) {
       latch(c, FAULT_LEAK);
     }
-    c->disagree_ms[channel] = disagree;
   }
   return CHECK_SENSORS;
 }
 
-static uint8_t drive_outputs(struct controller *c, uint16_t elapsed_ms) {
+static uint8_t drive_outputs(struct controller *c, uint32_t elapsed_ms) {
   static const int16_t vented[PROTOCOL_CHANNELS];
   output_step(&c->output, c->state == STATE_RUNNING ? c->set_points : vented, elapsed_ms);
   return CHECK_OUTPUTS;
@@ -354,8 +352,7 @@ uint8_t controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms) 
 
 uint8_t controller_update(struct controller *c, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,
                           uint32_t now_ms) {
-  uint32_t since = now_ms - c->now_ms;
-  uint16_t elapsed_ms = (uint16_t)(since < 1000 ? since : 1000);
+  uint32_t elapsed_ms = now_ms - c->now_ms;
   uint8_t checks = 0;
 
   c->now_ms = now_ms;
@@ -378,5 +375,3 @@ uint8_t controller_update(struct controller *c, const int16_t measured[PROTOCOL_
 uint16_t controller_counts(const struct controller *c, uint8_t channel) { return output_counts(&c->output, channel); }
 
 int16_t controller_next_byte(struct controller *c) { return c->tx_tail == c->tx_head ? -1 : c->tx[c->tx_tail++]; }
-
-uint16_t controller_size(void) { return (uint16_t)sizeof(struct controller); }

@@ -42,8 +42,8 @@ struct controller {
   uint32_t last_progress_ms; /* last frame with a later tick */
 
   int16_t measured[PROTOCOL_CHANNELS];
-  uint16_t over_ms[PROTOCOL_CHANNELS];
-  int16_t disagree_ms[PROTOCOL_CHANNELS]; /* counts up while above, down while below what is applied */
+  uint16_t over_ms[PROTOCOL_CHANNELS];                               /* above P_OVER for so long */
+  uint16_t above_ms[PROTOCOL_CHANNELS], below_ms[PROTOCOL_CHANNELS]; /* off what is applied for so long */
   uint16_t supply_mv;
 
   struct output_stage output;
@@ -72,9 +72,6 @@ uint16_t controller_counts(const struct controller *c, uint8_t channel);
 
 /* Next byte for the host, or -1. What does not fit the queue is dropped as whole frames: the board never waits. */
 int16_t controller_next_byte(struct controller *c);
-
-/* Size of the struct, for callers that only hold memory for it. */
-uint16_t controller_size(void);
 
 #ifdef __cplusplus
 }

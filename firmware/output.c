@@ -5,9 +5,9 @@
 #include "limits.h"
 #include "pins.h"
 
-void output_step(struct output_stage *stage, const int16_t targets[PROTOCOL_CHANNELS], uint16_t elapsed_ms) {
+void output_step(struct output_stage *stage, const int16_t targets[PROTOCOL_CHANNELS], uint32_t elapsed_ms) {
   /* After a stall the outputs go on from where they are instead of leaping. */
-  uint32_t budget = (uint32_t)SLEW * (elapsed_ms < 20 ? elapsed_ms : 20) + stage->remainder;
+  uint32_t budget = SLEW * (elapsed_ms < 20 ? elapsed_ms : 20) + stage->remainder;
   int16_t step = (int16_t)(budget / 1000);
   stage->remainder = (uint16_t)(budget % 1000);
 

@@ -16,7 +16,7 @@ struct output_stage {
 };
 
 /* Moves every channel towards its target, clamped to 0 .. P_MAX, by no more than the slew limit allows in elapsed_ms. */
-void output_step(struct output_stage *stage, const int16_t targets[PROTOCOL_CHANNELS], uint16_t elapsed_ms);
+void output_step(struct output_stage *stage, const int16_t targets[PROTOCOL_CHANNELS], uint32_t elapsed_ms);
 
 /* All channels to 0 at once. */
 void output_dump(struct output_stage *stage);

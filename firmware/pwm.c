@@ -22,6 +22,9 @@
 
 #define WRITE_PIN(channel, pin, timer, unit, port, bit)       \
   case channel:                                               \
+    if (channel >= CHANNELS_USED) {                           \
+      break;                                                  \
+    }                                                         \
     if (counts == 0) {                                        \
       TCCR##timer##A &= (uint8_t)~_BV(COM##timer##unit##1);   \
       OCR##timer##unit = 0;                                   \
@@ -40,9 +43,6 @@ void pwm_begin(void) {
 }
 
 void pwm_write(uint8_t channel, uint16_t counts) {
-  if (channel >= CHANNELS_USED) {
-    return;
-  }
   /* A 16-bit register is written through one temporary byte that all of them share. */
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
     switch (channel) { CHANNEL_TABLE(WRITE_PIN) }

@@ -89,6 +89,14 @@ def test_arm_needs_a_second_of_heartbeats(board):
     assert board.counts == [0] * 12
 
 
+def test_arm_needs_a_heartbeat_at_all(board):
+    """Also on a board whose clock has just begun, where "none yet" must not look like "at 0 ms"."""
+    board.wait(1)
+    assert reason(board.arm()) == NackReason.STATE
+    board.wait(1500)
+    assert reason(board.arm()) == NackReason.STATE
+
+
 @pytest.mark.parametrize(("gap_ms", "state"), [(300, State.ARMED), (301, State.IDLE)])
 def test_arm_needs_unbroken_heartbeats(board, gap_ms, state):
     board.beat(900)  # ends 100 ms after the last one
@@ -146,6 +154,14 @@ def test_arm_again_is_the_same_session(board):
     (again,) = board.arm(new_session=1)
     assert isinstance(again, Status)
     assert board.state == State.ARMED
+
+
+@pytest.mark.parametrize(("session", "expected"), [(2, NackReason.STATE), (3, NackReason.SESSION)])
+def test_arm_for_another_session_while_armed_refused(board, session, expected):
+    board.beat(1100)
+    board.arm()
+    assert reason(board.arm(new_session=session)) == expected
+    assert reason(board.set(800, session=session)) == NackReason.SESSION
 
 
 def test_arm_refused_while_running_and_old_arm_after(running):
@@ -385,6 +401,15 @@ def test_short_over_pressure_is_none(running):
         running.wait(1)
         running.tell(protocol.Heartbeat(running.tick))
     assert running.faults == Fault(0)
+
+
+def test_over_pressure_over_a_stall_of_any_length_dumps(board):
+    """The next pass comes late, after a minute and a bit that 16 bits of milliseconds would take for 50 ms."""
+    board.wait(1)
+    board.measured[0] = 9000
+    board.now_ms += 0x10000 + 50
+    board.update()
+    assert board.faults == Fault.OVER_PRESSURE
 
 
 def test_over_pressure_is_seen_while_idle_and_stays_latched(board):
