@@ -1,7 +1,7 @@
 """Line and branch coverage of the firmware by its native tests: a table, and exit code 1 below 100 %.
 
-Every file of `firmware/` counts that is compiled natively: the logic (frame.c, output.c, controller.c) and, on a chip of
-plain memory, what touches the hardware (pwm.c, sensors.c, boot.c).
+Every file of `firmware/` that is compiled natively counts: the logic (frame.c, output.c, controller.c) and, on a chip
+of plain memory, what touches the hardware (pwm.c, sensors.c, boot.c).
 """
 
 from __future__ import annotations
