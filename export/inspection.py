@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import onnx
 
+from modsoft.runtime.command import printable
 from modsoft.runtime.controller import Controller
 
 
@@ -33,7 +34,7 @@ def print_model(path: Path) -> None:
 
 
 def _print_table(table: dict[str, Any], depth: int) -> None:
-    for name, value in table.items():
+    for name, value in ((printable(name), value) for name, value in table.items()):
         if isinstance(value, dict):
             print(f"{'  ' * depth}{name}:")
             _print_table(value, depth + 1)
@@ -48,4 +49,4 @@ def _print_table(table: dict[str, Any], depth: int) -> None:
 def _short(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(_short(entry) for entry in value)
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{value:.6g}" if isinstance(value, float) else printable(str(value))

@@ -85,8 +85,13 @@ def _run(command: click.Command, interrupted: str) -> int:
 
 
 def _told(command: click.Command, error: ModsoftError) -> int:
-    _tell(f"{command.name}: {error}")
+    _tell(f"{command.name}: {printable(str(error))}")
     return error.exit_code
+
+
+def printable(text: str) -> str:
+    """The text with escapes for control characters: a terminal would obey those of a stranger's file."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
 def _stream_error(error: OSError) -> OutputError:

@@ -116,5 +116,6 @@ def network_of(checkpoint: dict[str, Any]) -> nn.Module:
         network = networks.build(description)
         network.load_state_dict(weights)
     except (RuntimeError, TypeError, ValueError, KeyError) as error:
-        raise ModelError(f"the checkpoint's weights do not fit its own description: {error}") from error
+        told = " ".join(str(error).split())
+        raise ModelError(f"the checkpoint's weights do not fit its own description: {told}") from error
     return network.eval()

@@ -1,5 +1,6 @@
 """An ONNX model from a stranger reads nothing but itself, and is refused in one line."""
 
+import json
 import os
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from modsoft.export import cli as export_cli
+from modsoft.export import inspection
 from modsoft.hil import cli as hil_cli
 from modsoft.runtime import artefact
 from modsoft.runtime import cli as runtime_cli
@@ -86,6 +88,26 @@ def test_the_commands_end_with_65(tmp_path, monkeypatch, model_file, main, befor
     code, said = ended(main, *before, path, *after)
     assert (code, len(said)) == (65, 1), said
     assert set(tmp_path.iterdir()) == before_it
+
+
+def test_what_a_model_says_does_not_command_the_terminal(tmp_path, model_file, ended, capfd):
+    """Of all texts, those of the provenance are free."""
+    clear = "\x1b[2J"
+    model, path = onnx.load(model_file), tmp_path / "model.onnx"
+    (entry,) = model.metadata_props
+    said = json.loads(entry.value)
+    said["provenance"] = {"seed": f"1{clear}"}
+    entry.value = json.dumps(said, separators=(",", ":"))
+    path.write_bytes(resealed(model))
+    inspection.print_model(path)
+    out = capfd.readouterr().out
+    assert "1\\x1b[2J" in out
+    assert "\x1b" not in out
+    said["kind"] = clear
+    entry.value = json.dumps(said, separators=(",", ":"))
+    path.write_bytes(resealed(model))
+    code, lines = ended(export_cli.main, "--inspect", path)
+    assert (code, len(lines), "\x1b" in lines[0]) == (65, 1, False)
 
 
 def test_a_model_with_weights_at_an_address_of_the_memory(tmp_path, monkeypatch, model_file, refused):
