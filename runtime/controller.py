@@ -183,6 +183,7 @@ class Controller:
             "features of the graph": (self.unit.feature_size, len(said.features)),
             "sequence axis": (said.sequence_axis, network.sequence_axis),
             "network": ({name: getattr(network, name) for name in self.unit.sizes}, self.unit.sizes),
+            "time steps T": (network.history, (len(said.features) - 1) // (said.state_size + said.action_size)),
             "features": (said.features, configuration.feature_names(said.kind, network.history)),
         }
         for name, (found, expected) in pairs.items():
