@@ -1,0 +1,300 @@
+"""How fast modsoft-train reaches the paper's Table 1, against the same training done the way of the paper's authors.
+
+`python tools/bench/training.py`. Two processes take turns of a few seconds on one core, so that whatever else the
+machine does hits both alike. Same samples, same split (the paper's, shuffled), same network, one torch thread each:
+
+    ours     modsoft.training.train.train with its own defaults; its learning rate ends with --iterations
+    authors  a Python data set of windows read through a DataLoader with one worker; Table S1: batch 64, Adam at a
+             constant rate of 0.001; dropout 0.1; the validation error every 500 iterations
+
+Either is there when its validation error, mean over the modules, is at most Table 1's. Times are processor time of the
+training process, validation included: what it takes by the clock where nothing else runs. The authors' worker works
+beside it on the other core and is not counted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch is loaded: see modsoft-train
+
+import click
+import numpy as np
+import torch
+
+from modsoft.runtime import robot as robots
+from modsoft.training import collect, dataset, train
+from modsoft.training.dataset import DataSet, Windows
+from modsoft.training.networks import BiLSTM
+
+TABLE_1_PERCENT = (1.63, 1.49, 1.11, 0.70)  # biLSTM, modules 1 to 4
+SAMPLES, STEPS = 16_000, 1000  # the paper's; control steps in an episode
+AUTHORS_CHECK = 500  # iterations between looks at the validation error
+TURN_S = 5.0
+WAYS = ("ours", "authors")
+
+
+@dataclasses.dataclass(frozen=True)
+class Race:
+    """What both ways train, and when they have arrived."""
+
+    data: str  # file
+    samples: int
+    layers: int
+    hidden: int
+    iterations: int  # of ours
+    target_percent: float  # validation error, mean over the modules
+    seed: int
+
+
+def first_samples(data: DataSet, samples: int) -> DataSet:
+    """The first episodes of a data set that make up so many samples."""
+    episodes = -(-samples // data.action.shape[1])
+    return dataclasses.replace(data, configuration=data.configuration[:episodes], action=data.action[:episodes])
+
+
+def tell(iteration: int, validation_percent: float, batch: int) -> None:
+    """A line to the referee; it waits here while it is the other's turn."""
+    state = {"iteration": iteration, "percent": validation_percent, "batch": batch, "cpu_s": time.process_time()}
+    print(json.dumps(state), flush=True)
+
+
+def ours(race: Race, data: DataSet) -> None:
+    """modsoft-train without its command line."""
+    settings = train.Settings(
+        **train.BY_KIND[data.robot.robot.kind] | {"split": "shuffled", "iterations": race.iterations},
+        layers=race.layers,
+        hidden=race.hidden,
+        seed=race.seed,
+    )
+
+    def progress(told: train.Progress) -> None:
+        if told.iteration == 1 or told.iteration % 20 == 0:
+            tell(told.iteration, told.validation_percent, settings.batch)
+
+    with tempfile.TemporaryDirectory() as folder:
+        made = train.train(data, Path(folder) / "model.pt", settings, progress)
+    said = made["provenance"]
+    tell(said["iterations_done"], said["validation_percent"], settings.batch)
+
+
+class WindowSet(torch.utils.data.Dataset[tuple[np.ndarray, np.ndarray]]):
+    """Windows one by one, as a DataLoader asks for them."""
+
+    def __init__(self, windows: Windows):
+        self.windows = windows
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        return self.windows.features[index], self.windows.targets[index]
+
+
+def authors(race: Race, data: DataSet) -> None:
+    """The training of the paper, until someone ends it."""
+    torch.set_num_threads(1)
+    torch.manual_seed(race.seed)
+    history = train.BY_KIND[data.robot.robot.kind]["history"]
+    training, validation, _ = dataset.split(data, history, "shuffled", race.seed)
+    network = BiLSTM(training.features.shape[-1], training.targets.shape[-1], race.layers, race.hidden, dropout=0.1)
+    optimiser = torch.optim.Adam(network.parameters(), lr=0.001)
+    loader = torch.utils.data.DataLoader(WindowSet(training), batch_size=64, shuffle=True, num_workers=1)
+    percent = float("inf")
+    for iteration, (features, targets) in enumerate(_for_ever(loader), start=1):
+        network.train()
+        loss = torch.nn.functional.mse_loss(network(features), targets)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        if iteration % AUTHORS_CHECK == 0:
+            percent = min(percent, float(train.estimation_errors(network, validation).mean()))
+        if iteration == 1 or iteration % 20 == 0:
+            tell(iteration, percent, 64)
+
+
+def _for_ever(loader: torch.utils.data.DataLoader) -> Iterator[Any]:
+    while True:
+        yield from loader
+
+
+RUNS: dict[str, Callable[[Race, DataSet], None]] = {"ours": ours, "authors": authors}
+
+
+class Runner:
+    """One way in a process group of its own, which stands still except in its turns."""
+
+    def __init__(self, way: str, race: Race):
+        self.target_percent = race.target_percent
+        self.told: list[dict[str, Any]] = []
+        self.lines = b""
+        self.process = subprocess.Popen(
+            [sys.executable, __file__, "--run", way, json.dumps(dataclasses.asdict(race))],
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        assert self.process.stdout is not None
+        self._read(self.process.stdout.readline())  # the first step is done: imports and data are behind it
+        if not self.told:
+            raise click.ClickException(f"{way}: ended before its first step; what it said stands above")
+        self._signal(signal.SIGSTOP)
+        os.set_blocking(self.process.stdout.fileno(), False)
+
+    def turn(self, seconds: float) -> None:
+        """Lets it run so long, then reads what it told."""
+        self._signal(signal.SIGCONT)
+        time.sleep(seconds)
+        self._signal(signal.SIGSTOP)
+        assert self.process.stdout is not None
+        self._read(self.process.stdout.read() or b"")
+
+    def _read(self, text: bytes) -> None:
+        *whole, self.lines = (self.lines + text).split(b"\n")
+        self.told += [json.loads(line) for line in whole]
+
+    def end(self) -> None:
+        self._signal(signal.SIGKILL)
+        self.process.wait()
+
+    def _signal(self, number: int) -> None:
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, number)
+
+    @property
+    def over(self) -> bool:
+        return arrived(self.told, self.target_percent) is not None or self.process.poll() is not None
+
+
+def arrived(told: list[dict[str, Any]], target_percent: float) -> dict[str, Any] | None:
+    """The first that was told with the error reached."""
+    return next((line for line in told if line["percent"] <= target_percent), None)
+
+
+def figures(told: list[dict[str, Any]], target_percent: float) -> dict[str, Any]:
+    """What is known of one way; the time to the error is None where it did not get there."""
+    first, there = told[0], arrived(told, target_percent)
+    last = there or told[-1]
+    seconds = last["cpu_s"] - first["cpu_s"]
+    iterations_per_s = (last["iteration"] - first["iteration"]) / seconds
+    best = min(line["percent"] for line in told)
+    return {
+        "batch": last["batch"],
+        "iterations": last["iteration"],
+        "iterations_per_s": iterations_per_s,
+        "samples_per_s": iterations_per_s * last["batch"],
+        "seconds": seconds,
+        "seconds_to_target": seconds if there else None,
+        "best_percent": best if np.isfinite(best) else None,
+    }
+
+
+def compared(race: Race, one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """Figures of ours and of the authors' way, and our advantage: more than 1 is better."""
+    ratios = {name: one[name] / other[name] for name in ("iterations_per_s", "samples_per_s")}
+    reached = one["seconds_to_target"]
+    # Where the authors' way is not there yet, its time so far is a lower bound.
+    ratios["time_to_target"] = other["seconds"] / reached if reached else None
+    return {
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "torch": str(torch.__version__),
+        "race": {name: value for name, value in dataclasses.asdict(race).items() if name != "data"},
+        "ours": one,
+        "authors": other,
+        "ratios": ratios,
+        "ratio_is_lower_bound": other["seconds_to_target"] is None,
+    }
+
+
+def raced(race: Race, minutes: float, turn_s: float) -> dict[str, Any]:
+    """Both in turns until both are there, or for so many minutes by the clock."""
+    runners = {}
+    try:
+        for way in WAYS:
+            runners[way] = Runner(way, race)
+        end_s = time.monotonic() + 60.0 * minutes
+        while time.monotonic() < end_s and not all(runner.over for runner in runners.values()):
+            for way, runner in runners.items():
+                if not runner.over:
+                    runner.turn(turn_s)
+                    told = runner.told[-1]
+                    click.echo(f"{way}: iteration {told['iteration']}, best {told['percent']:.2f} %", err=True)
+        silent = [way for way, runner in runners.items() if len(runner.told) < 2]
+        if silent:
+            raise click.ClickException(f"{', '.join(silent)}: no step within {minutes:g} minutes; give more --minutes")
+        return compared(race, *(figures(runners[way].told, race.target_percent) for way in WAYS))
+    finally:
+        for runner in runners.values():
+            runner.end()
+
+
+def table(result: dict[str, Any]) -> str:
+    race = result["race"]
+    lines = [f"{result['processor']}, {result['cores']} cores, torch {result['torch']}, {race['samples']} samples", ""]
+    lines += [f"| way | batch | iterations/s | samples/s | iterations | best % | s to {race['target_percent']:.2f} % |"]
+    lines += ["| --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
+    for way in WAYS:
+        row = result[way]
+        reached = row["seconds_to_target"]
+        best = "none yet" if row["best_percent"] is None else f"{row['best_percent']:.2f}"
+        lines.append(
+            f"| {way} | {row['batch']} | {row['iterations_per_s']:.1f} | {row['samples_per_s']:.0f} "
+            f"| {row['iterations']} | {best} | {f'{reached:.0f}' if reached else 'not reached'} |"
+        )
+    ratios = result["ratios"]
+    lines += ["", f"ours over the authors': {ratios['samples_per_s']:.2f} times the samples/s"]
+    if ratios["time_to_target"]:
+        least = "at least " if result["ratio_is_lower_bound"] else ""
+        lines += [f"to the same error: {least}{ratios['time_to_target']:.2f} times as fast"]
+    return "\n".join(lines)
+
+
+@click.command(help=__doc__)
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all figures here, one JSON object.")
+@click.option("--quick", is_flag=True, help="A small network to a coarse error: less than a minute.")
+@click.option("--data", type=click.Path(path_type=Path), help="Data set to train on; collected where none is given.")
+@click.option("--iterations", default=6000, show_default=True, help="Of ours: few that still reach the error.")
+@click.option("--minutes", default=90.0, show_default=True, help="By the clock, for both together.")
+@click.option("--seed", default=0, show_default=True)
+@click.option("--run", nargs=2, hidden=True)
+def main(
+    json_file: Path | None,
+    quick: bool,
+    data: Path | None,
+    iterations: int,
+    minutes: float,
+    seed: int,
+    run: tuple[str, str] | None,
+) -> None:
+    if run:
+        race = Race(**json.loads(run[1]))
+        RUNS[run[0]](race, first_samples(dataset.read(Path(race.data)), race.samples))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        samples, turn_s = (3200, 1.0) if quick else (SAMPLES, TURN_S)
+        if data is None:
+            data = Path(folder) / "d.h5"
+            collect.collect(robots.load("cable-4"), data, samples, steps=STEPS if not quick else 200)
+        race = Race(str(data), samples, 4, 128, iterations, float(np.mean(TABLE_1_PERCENT)), seed)
+        if quick:
+            race = dataclasses.replace(race, layers=2, hidden=32, iterations=600, target_percent=8.0)
+            minutes = min(minutes, 0.7)
+        result = raced(race, minutes, turn_s)
+    click.echo(table(result))
+    if json_file:
+        json_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
