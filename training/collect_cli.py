@@ -10,6 +10,7 @@ import click
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.command import entry
+from modsoft.runtime.files import check_writable
 
 
 @click.group(
@@ -42,7 +43,8 @@ from modsoft.runtime.command import entry
     multiple=True,
     metavar="NAME=VALUE",
     help="For submitit: slurm_partition=long, timeout_min=60, ... For dask: scheduler=ADDRESS, or cluster=SLURMCluster "
-    "and its parameters (cores=1, memory=2GB, ...). May be repeated.",
+    "and its parameters (cores=1, memory=2GB, ...); what its ports get is run, so keep them off open networks, or give "
+    "dask's TLS (security=true). May be repeated.",
 )
 @click.option("--plant", help="Simulator: elastica, fleet-plain, fleet-avx2, ...  [default: the fastest here]")
 @click.pass_context
@@ -125,6 +127,7 @@ def plot(data_files: tuple[Path, ...], out: Path) -> None:
     Example:
       modsoft-collect plot staged.h5 random.h5 --out workspace.png
     """
+    check_writable(out)
     from modsoft.training import coverage
 
     found = coverage.compare(list(data_files))

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.runtime.files import written
 from modsoft.training import dataset
 from modsoft.training.robots import PLANTS
 
@@ -108,7 +109,8 @@ def line(coverage: Coverage) -> str:
 
 
 def draw(found: list[Coverage], out: Path) -> None:
-    """A column for each data set: seen from the side, gravity downwards, and if not planar along the axis too."""
+    """A column for each data set: seen from the side, gravity downwards, and if not planar along the axis too. `out` is
+    written whole or not at all, in the format of its ending; `UsageError` for one that is none."""
     from matplotlib.figure import Figure
 
     views = [(0, 2, "x (mm)", "z (mm)")] + ([] if found[0].planar else [(0, 1, "x (mm)", "y (mm)")])
@@ -127,7 +129,8 @@ def draw(found: list[Coverage], out: Path) -> None:
                 axis.legend(fontsize=7, markerscale=6, loc="upper left")
         if column == 0:
             axes[0, 0].invert_yaxis()  # shared along the row
-    try:
-        figure.savefig(out, dpi=150)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{out}: the picture cannot be written ({error}); give --out FILE.png") from error
+    with written(out) as temporary:
+        try:
+            figure.savefig(temporary, dpi=150, format=out.suffix[1:] or "png")
+        except ValueError as error:  # of a format that there is none
+            raise UsageError(f"{out}: the picture cannot be written ({error}); give --out FILE.png") from error

@@ -1,14 +1,17 @@
 """The space that data sets cover."""
 
+import errno
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import from_angles_deg
-from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.runtime.errors import ModelError, OutputError, UsageError
 from modsoft.training import collect, coverage, dataset
 from modsoft.training.arm import Arm
 
@@ -93,5 +96,23 @@ def test_the_command_draws_and_tells(tmp_path):
     figures = ", ".join(f"{value:.4g}" for value in expected)
     assert f"s.h5 (staged): modules 1 to 3 cover {figures} cm², 300 samples" in found.stdout
     assert (tmp_path / "w.png").read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(UsageError, match="cannot be written"):
-        coverage.draw(coverage.compare([tmp_path / "s.h5"]), tmp_path / "none" / "w.png")
+
+
+def test_a_picture_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    write(tmp_path / "s.h5", "pneumatic-3", "staged", 2)
+    found = coverage.compare([tmp_path / "s.h5"])
+    for name, says in (("none/w.png", "no folder"), ("w.txt", "cannot be written"), ("w.tmp", "cannot be written")):
+        with pytest.raises(UsageError, match=says):
+            coverage.draw(found, tmp_path / name)
+    coverage.draw(found, tmp_path / "w.svg")
+    (tmp_path / "w.png").write_text("old")
+
+    def full(figure, path, **options):
+        Path(path).write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", full)
+    with pytest.raises(OutputError, match=r"w\.png: cannot be written \(No space"):
+        coverage.draw(found, tmp_path / "w.png")
+    assert (tmp_path / "w.png").read_text() == "old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["s.h5", "w.png", "w.svg"]
