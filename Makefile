@@ -9,7 +9,7 @@ export MPLBACKEND ?= Agg
 PYTEST := .venv/bin/python -m pytest
 INSTALLED := .venv/.installed
 
-.PHONY: demo install test test-cluster reliability check coverage firmware clean
+.PHONY: demo install test test-cluster reliability soak check coverage firmware clean
 
 demo: $(INSTALLED)
 	.venv/bin/python tools/demo.py
@@ -34,6 +34,10 @@ test-cluster: $(INSTALLED)
 # The failure matrix, a test a row, to docs/reliability.md.
 reliability: $(INSTALLED)
 	.venv/bin/python tools/reliability.py
+
+# An hour of the rig with a fault about once a minute, then the long proofs.
+soak: $(INSTALLED)
+	.venv/bin/python tools/soak.py --proofs
 
 check: $(INSTALLED)
 	tools/check.sh

@@ -1,0 +1,197 @@
+"""What a soak says of its faults and runs: right ones pass, everything that is planted is found. And a short one."""
+
+import importlib.util
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flawless import COUNTS, flawless_run, slewed, told
+
+from modsoft.hil import soak as soaks
+from modsoft.hil.aftermath import Injected, Ran, judge_fault, judge_log, judge_valves
+from modsoft.hil.faults import FAULTS, Log
+from modsoft.runtime import log as logs
+
+TOOL = Path(__file__).parents[2] / "tools" / "soak.py"
+PASSING = next(fault for fault in FAULTS if fault.name == "tool hidden for a moment")
+ENDING = next(fault for fault in FAULTS if fault.name == "cable pulled")
+
+
+@pytest.fixture(scope="module")
+def tool():
+    spec = importlib.util.spec_from_file_location("soak_tool", TOOL)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_faults_are_of_the_matrix_and_say_what_must_follow():
+    assert len({fault.name for fault in FAULTS}) == len(FAULTS)
+    for fault in FAULTS:
+        assert 1 <= fault.row <= 30
+        assert fault.goes_by or fault.codes, f"{fault.name}: nothing follows"
+        assert re.compile(fault.says)
+    assert len([fault for fault in FAULTS if not fault.codes]) >= 5, "for the first third"
+
+
+def test_the_log_is_read_as_it_grows_and_only_in_whole_lines(tmp_path):
+    path = tmp_path / "run.jsonl"
+    path.write_bytes(b'{"event":"start"}\n{"tick":0}\n{"tick":1')
+    log = Log(path)
+    assert [line["tick"] for line in log.new()] == [0]
+    with path.open("ab") as file:
+        file.write(b"1}\n")
+    assert [line["tick"] for line in log.new()] == [11]
+    assert log.new() == []
+    assert log.last == {"tick": 11}
+    log.close()
+
+
+# ---- A fault
+
+
+def events(*duties):
+    """The board's: channel 0 at these duties, at these milliseconds."""
+    pwm = {"event": "pwm", "channel": 0}
+    return [{**pwm, "duty": duty, "t_us": 1e3 * at, "mono_ns": at * 10**6} for at, duty in duties]
+
+
+LOST = "modsoft-runtime: board at /dev/ttyACM0 lost: no word from the board for 0.35 s"
+
+
+@pytest.mark.parametrize(
+    ("fault", "noticed_ms", "code", "said", "wrong"),
+    [
+        (PASSING, 300.0, None, "", []),
+        (PASSING, None, None, "", ["not noticed"]),
+        (PASSING, 300.0, 79, "modsoft-runtime: tool hidden", ["it ended the run with 79"]),
+        (ENDING, None, 74, LOST, []),
+        (ENDING, None, 70, LOST, ["expected exit code (74,) and 'board.*lost'"]),
+        (ENDING, None, 74, "modsoft-runtime: no idea", ["expected exit code (74,) and 'board.*lost'"]),
+        (ENDING, None, None, "", ["the run went on"]),
+    ],
+)
+def test_a_fault_has_to_be_noticed_and_named(fault, noticed_ms, code, said, wrong):
+    each = Injected(fault, 1, 0.0, mono_ns=10**9, noticed_ms=noticed_ms)
+    board = events((900, 0.1), (1500, 0.0))
+    judge_fault(each, Ran(1, code=code or 0), code is not None, said, board)
+    assert each.wrong == wrong
+
+
+def test_a_board_that_vents_too_late_or_never_is_found():
+    for last_ms, found in ((1700, []), (1701, ["valves at 0 after 701 ms, allowed 700"])):
+        each = Injected(ENDING, 1, 0.0, mono_ns=10**9)
+        judge_fault(each, Ran(1, code=74), True, LOST, events((900, 0.1), (last_ms, 0.0)))
+        assert each.wrong == found
+    each = Injected(ENDING, 1, 0.0, mono_ns=10**9)
+    judge_fault(each, Ran(1, code=74), True, LOST, events((900, 0.1)))
+    assert each.wrong == ["valves at 0 after nan ms, allowed 700"]
+
+
+# ---- Valves
+
+
+@pytest.fixture
+def flawless():
+    return flawless_run()
+
+
+def judged(record, stopped_ns=None):
+    ran = Ran(1)
+    judge_valves(ran, record, stopped_ns)
+    return ran.wrong
+
+
+def with_counts(record, from_ms, until_ms, counts):
+    at_ns = int(record.mono_ns[60])
+    return replace(record, valves=told(record, at_ns + from_ms * 10**6, at_ns + until_ms * 10**6, counts))
+
+
+def test_right_valves_pass(flawless):
+    assert judged(flawless) == []
+
+
+def test_a_valve_above_or_below_what_was_commanded_is_found_at_any_time(flawless):
+    assert any("above" in word for word in judged(with_counts(flawless, 12, 22, COUNTS // 2)))
+    assert any("below" in word for word in judged(with_counts(flawless, 12, 22, 0)))
+    assert any("off" in word for word in judged(with_counts(flawless, 300, 310, 0)))
+
+
+def test_a_board_that_vents_by_itself_is_never_wrong_but_one_that_opens_is(flawless):
+    since = int(flawless.mono_ns[60])
+    assert judged(with_counts(flawless, 12, 350, 0), since) == []
+    assert any("above" in word for word in judged(with_counts(flawless, 12, 22, COUNTS // 2), since))
+
+
+def test_set_points_that_were_not_acknowledged_may_not_have_arrived(flawless):
+    """The registers stay for a tick where they were, and the log says otherwise."""
+    k = 60
+    arrived, acknowledged = flawless.commanded_bar.copy(), flawless.acknowledged_ms.copy()
+    arrived[k] = arrived[k - 1]
+    stayed = replace(flawless, valves=slewed(flawless.start_bar, arrived)[0])
+    assert any("off" in word for word in judged(stayed))
+    acknowledged[k] = np.nan
+    assert judged(replace(stayed, acknowledged_ms=acknowledged)) == []
+
+
+def test_a_valve_left_open_and_one_opened_too_early_are_found(flawless):
+    left = flawless.valves._replace(duty=np.vstack([flawless.valves.duty[:-1], flawless.valves.duty[-2:-1]]))
+    assert "a valve was left open" in judged(replace(flawless, valves=left))
+    early = told(flawless, flawless.start_ns - 2 * 10**9, flawless.start_ns - 10**9, 1)
+    assert "a valve was open before the first set-point" in judged(replace(flawless, valves=early))
+
+
+# ---- The log
+
+
+def log_of(**changed):
+    meta = {"exit_code": 74, "lines_lost": 0, "reason": "board lost"} | changed
+    return logs.Run(meta, [{"tick": 0}, {"tick": 2}], [{"event": "start"}, {"event": "end"}])
+
+
+@pytest.mark.parametrize(
+    ("read", "said", "wrong"),
+    [
+        (log_of(), "board lost", []),
+        (log_of(), "", ["the log and the terminal give different reasons"]),
+        (log_of(exit_code=None), "board lost", ["the log says exit code None"]),
+        (log_of(lines_lost=2), "board lost", ["2 lines of the log lost"]),
+        (log_of()._replace(ticks=[{"tick": 2}, {"tick": 0}]), "board lost", ["ticks of the log out of order"]),
+        (log_of()._replace(events=[{"event": "start"}]), "board lost", ["the log has no end"]),
+    ],
+)
+def test_a_log_is_whole_and_says_what_the_terminal_said(read, said, wrong):
+    ran = Ran(1, code=74)
+    judge_log(ran, read, said)
+    assert ran.wrong == wrong
+
+
+# ---- The whole
+
+
+def test_memory_that_grows_is_told_an_hour(tool):
+    samples = [(5.0 * k, 80.0 + 0.001 * k) for k in range(200)]  # a kilobyte every five seconds
+    assert tool.growth_mib_per_h(samples) == pytest.approx(0.72)
+    assert tool.growth_mib_per_h(samples[:40]) is None
+
+
+@pytest.mark.realtime
+def test_a_short_soak(tool, model_file, tmp_path, monkeypatch):
+    """A fault that goes by, again and again, and one that ends the run: the next one starts on the same board."""
+    chosen = [fault for fault in FAULTS if fault.name in ("tool hidden for a moment", "board reset")]
+    monkeypatch.setattr(soaks, "FAULTS", chosen)
+    out, report = tmp_path / "out", tmp_path / "soak.md"
+    monkeypatch.setattr(sys, "argv", ["soak", "--minutes", "0.6", "--every", "3", "--model", str(model_file),
+                                      "--out", str(out), "--report", str(report)])  # fmt: skip
+    with pytest.raises(SystemExit) as left:
+        tool.main()
+    page = report.read_text()
+    assert left.value.code == 0, page
+    assert all(f"| {fault.name} |" in page for fault in chosen), page
+    [folder] = out.iterdir()
+    assert logs.read(next((folder / "run-001").glob("*/"))).meta["exit_code"] == 74
+    assert json.loads((folder / "run-002" / "board.jsonl").read_text().splitlines()[0])["event"] == "ready"
