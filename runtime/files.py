@@ -7,8 +7,12 @@ import os
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from tokenize import TokenError
 
 from modsoft.runtime.errors import ModelError, OutputError, UsageError
+
+# What numpy.load raises for a file that is damaged, none of its own, or claims to be huge.
+NOT_AN_ARRAY = (ValueError, EOFError, MemoryError, TokenError)
 
 
 def check_is_file(path: Path, what: str, advice: str) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from modsoft.runtime import task_tables
 from modsoft.runtime.configuration import from_angles_deg
 from modsoft.runtime.errors import UsageError
+from modsoft.runtime.files import NOT_AN_ARRAY
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.task_tables import Bend
 
@@ -105,7 +106,7 @@ def load_task(name_or_file: str, robot: Robot) -> Array:
         desired = np.load(name_or_file, allow_pickle=False)
     except OSError as error:
         raise UsageError(f"task file {name_or_file}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, EOFError) as error:
+    except NOT_AN_ARRAY as error:
         # Without numpy's own words: they advise to load the file unsafely.
         raise UsageError(
             f"task file {name_or_file}: not a readable .npy array of floats: damaged, or of another format; "

@@ -23,7 +23,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from modsoft.runtime.errors import InUse, ModelError, OutputError
-from modsoft.runtime.files import written
+from modsoft.runtime.files import NOT_AN_ARRAY, written
 from modsoft.training.dataset import Episode
 
 EPISODE = re.compile(r"episode-([0-9]{6}|[1-9][0-9]{6,8})\.npz")
@@ -119,7 +119,7 @@ class Shards:
         try:
             with np.load(path, allow_pickle=False) as file:
                 return Episode(file["configuration"], file["action"], int(file["redrawn"]))
-        except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, BadZipFile) as error:
+        except (OSError, KeyError, TypeError, BadZipFile, *NOT_AN_ARRAY) as error:
             raise ModelError(
                 f"{path}: no whole episode ({error}); every worker must share this folder, run again to make it"
             ) from error

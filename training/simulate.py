@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from modsoft.runtime import robot as robots
 from modsoft.runtime.command import entry
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import check_writable, written
+from modsoft.runtime.files import NOT_AN_ARRAY, check_writable, written
 from modsoft.runtime.robot import Robot
 
 Array = NDArray[np.float64]
@@ -24,7 +24,7 @@ def read_actions(path: str, robot: Robot) -> Array:
         actions = np.load(path, allow_pickle=False)
     except FileNotFoundError as error:
         raise ModelError(f"{path}: no such file; expected a .npy array {wanted}") from error
-    except (OSError, ValueError, EOFError) as error:  # numpy's own words recommend loading it unsafely
+    except (OSError, *NOT_AN_ARRAY) as error:  # numpy's own words recommend loading it unsafely
         why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged, or another format"
         raise ModelError(f"{path}: not a .npy array of numbers ({why}); expected {wanted}") from error
     if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiu":

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.errors import UsageError
+from modsoft.runtime.trajectory import load_task
 from modsoft.training import collect_cli, dataset, simulate, train_cli
 
 
@@ -100,6 +102,27 @@ def test_the_commands_end_with_65(tmp_path, monkeypatch, data_file, main, before
     code, said = ended(main, *before, data_file, *after)
     assert (code, len(said)) == (65, 1)
     assert set(tmp_path.iterdir()) == before_it
+
+
+def npy(shape, descr):
+    """The header of a .npy file, and nothing else."""
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}".encode().ljust(117)[:117] + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+
+
+@pytest.mark.parametrize(
+    "content",
+    [npy("(10000000000000, 2, 1)", "'<f8'"), npy("(3, 2, 1)", "'|O'"), npy("(3,)", "'" + "f8," * 100), b"\x93NUMPY"],
+    ids=["huge", "objects", "no end", "cut"],
+)
+def test_headers_that_claim_too_much(tmp_path, content, ended):
+    """As actions, and as the task of the real loop, where a wrong file is a wrong order: 2."""
+    path = tmp_path / "a.npy"
+    path.write_bytes(content)
+    code, said = ended(simulate.main, "--robot", "pneumatic-2", "--actions", path, "--out", tmp_path / "o")
+    assert (code, len(said)) == (65, 1)
+    with pytest.raises(UsageError, match=r"^task file [^\n]*: not a readable .npy array"):
+        load_task(str(path), robots.load("pneumatic-2"))
 
 
 def test_actions_that_are_a_pickle_end_modsoft_simulate_with_65(tmp_path, mark, evil, ended):
