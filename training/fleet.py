@@ -116,14 +116,15 @@ class Fleet:
     def positions(self) -> Array:
         """Module ends (B, N, 3), m."""
         every = self.plant.elements
-        return np.moveaxis(self._state[:, every::every, _POSITION], -1, 1).reshape(-1, self.modules, 3)[: self.count]
+        ends = np.moveaxis(self._state[:, every::every, _POSITION], -1, 1)
+        return ends.reshape(-1, self.modules, 3)[: self.count].copy()  # of one block it would be a view
 
     @property
     def directors(self) -> Array:
         """Frames of each module's last element (B, N, 3, 3), rows d1, d2, d3 in the lab frame."""
         every = self.plant.elements
         ends = np.moveaxis(self._state[:, every - 1 : -1 : every, _DIRECTOR], -1, 1)
-        return ends.reshape(-1, self.modules, 3, 3)[: self.count]
+        return ends.reshape(-1, self.modules, 3, 3)[: self.count].copy()
 
     @property
     def alive(self) -> NDArray[np.bool_]:

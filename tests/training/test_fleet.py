@@ -277,3 +277,14 @@ def test_the_benchmark_measures_prints_and_draws(tmp_path):
     assert benchmark.table(result).count("| pneumatic | 2 |") == 2
     benchmark.draw(result, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("count", [1, 20])
+def test_what_was_read_of_a_robot_stays_when_it_moves_on(count):
+    fleet = Fleet("cable", 2, count)
+    read = {name: getattr(fleet, name) for name in ("positions", "directors", "configuration")}
+    kept = {name: values.copy() for name, values in read.items()}
+    fleet.step(np.full((count, 2, 2), 0.5))
+    for name, values in read.items():
+        np.testing.assert_array_equal(values, kept[name], err_msg=name)
+        assert np.abs(getattr(fleet, name) - values).max() > 1e-3
