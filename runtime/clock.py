@@ -27,9 +27,10 @@ class Tick:
 class Ticker:
     """Slot k is due at start + k * period, computed anew each time so that nothing adds up.
 
-    A slot may begin, and send, until half a period after it was due; later than that it is skipped. So two commands
-    are never less than half a period apart, however long the process was starved. `now` must be monotonic: a step of
-    the wall clock has no effect.
+    A slot may begin, and send, until half a period after it was due; later than that it is skipped. It also waits for
+    half a period after the last command, which may have gone out late for a process that was halted just then. So two
+    commands are never less than half a period apart, however long the process was starved. `now` must be monotonic: a
+    step of the wall clock has no effect.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class Ticker:
         self.now = now
         self._wait = wait
         self._start_s = now()
+        self._sent_s = -math.inf
         self._index = -1
 
     def start(self, delay_s: float = 0.0) -> None:
@@ -58,12 +60,16 @@ class Ticker:
         """Whether this slot may no longer act. Asked again before the command is sent, for a step that took long."""
         return self.now() - self.due_s(index) > self.period_s / 2
 
+    def sent(self) -> None:
+        """A command has just been sent."""
+        self._sent_s = self.now()
+
     def next(self, idle: Callable[[], None] = lambda: None) -> Tick:
         """Waits for the next slot. `idle` is called at least once, then every 50 ms; what it raises goes through."""
         index = self._index + 1
         idle()
         while True:
-            left_s = self.due_s(index) - self.now()
+            left_s = max(self.due_s(index), self._sent_s + self.period_s / 2) - self.now()
             if left_s > 0:
                 self._wait(min(left_s, SLICE_S))
                 idle()

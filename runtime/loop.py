@@ -86,6 +86,7 @@ class Loop:
         self._idle()  # arming takes a second: who asked to stop in it must not see a valve open first
         began_ns = _ns(self.ticker.now())  # before it: no valve may be open earlier
         sequence: int | None = self.valves.set_pressures(0, bar)
+        self.ticker.sent()
         self.ticker.start(robot.loop.period_s)
         self.log({"event": "start", "mono_ns": began_ns, "commanded_bar": bar})
         targets, step = ahead(self.desired), -1
@@ -120,6 +121,7 @@ class Loop:
                 bar = channel_pressures_bar(robot, actuation, CHANNELS)
                 if not self.ticker.too_late(step):
                     sequence = self.valves.set_pressures(step + 1, bar)
+                    self.ticker.sent()
                     applied = actuation
                     line |= {"sent": True, "actuation": applied, "commanded_bar": bar}
                     guard.on_time()

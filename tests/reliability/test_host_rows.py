@@ -109,7 +109,7 @@ def test_row_25_disk_full_in_a_run(matrix_row, full, model_file, tmp_path):
 
 
 def starved(rng):
-    """A world whose process is not run for a while now and then, in a wait or in a step."""
+    """A world whose process is halted now and then: in a wait, in a step, or just before its command is out."""
     world = World(steps=15)
     wait, often = world.wait, rng.choice([0.02, 0.1, 0.3])
 
@@ -124,8 +124,12 @@ def starved(rng):
         world.time_s += stall_s()
         return np.full((3, 1), 0.1)
 
-    world.wait, world.answer = waited, answer
-    world.loop.ticker._wait = waited
+    def give(tick, pressures_bar):
+        world.time_s += stall_s()
+        return set_pressures(tick, pressures_bar)
+
+    world.loop.ticker._wait, world.answer = waited, answer
+    set_pressures, world.set_pressures = world.set_pressures, give
     return world
 
 

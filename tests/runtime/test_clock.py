@@ -107,22 +107,50 @@ def test_idle_is_asked_at_least_every_slice_and_may_raise():
 
 @given(
     st.lists(st.floats(0, 2), max_size=50),
-    st.lists(st.floats(0, 2), min_size=1, max_size=30),
+    st.lists(st.tuples(st.floats(0, 2), st.floats(0, 2)), min_size=1, max_size=30),
     st.floats(0.01, 1.0),
 )
 def test_commands_are_never_less_than_half_a_period_apart(overshoots, work, period_s):
+    """Whenever the process is halted: in a wait, in the work of a step, or just before its command is out."""
     time = Time()
     time.overshoot = iter(overshoots)
     ticker = time.ticker(period_s)
-    sent, slots, missed = [], [], 0
-    for busy_s in work:
+    sent, begun, slots, missed = [], [], [], 0
+    for busy_s, halted_s in work:
         tick = ticker.next()
         missed += tick.missed
         assert 0 <= tick.lateness_s <= period_s / 2 + 1e-9
         slots.append(tick.index)
+        begun.append(tick.start_s)
         time.time_s += busy_s
         if not ticker.too_late(tick.index):
+            time.time_s += halted_s
             sent.append(time.time_s)
+            ticker.sent()
     assert slots == sorted(set(slots))
     assert missed == slots[-1] + 1 - len(slots)  # every slot ran or was counted
-    assert all(b - a >= period_s / 2 - 1e-9 for a, b in itertools.pairwise(sent))
+    for times in (sent, begun):  # no burst, neither of commands nor of ticks
+        assert all(b - a >= period_s / 2 - 1e-9 for a, b in itertools.pairwise(times))
+
+
+@given(st.lists(st.floats(0, 2), max_size=30), st.integers(1, 30))
+def test_never_two_ticks_in_one_period(overshoots, count):
+    time = Time()
+    time.overshoot = iter(overshoots)
+    ticker = time.ticker()
+    periods = [round((ticker.next().start_s - 1000.0) / 0.4 + 1e-9) for _ in range(count)]
+    assert periods == sorted(set(periods))
+
+
+def test_a_command_that_was_held_up_puts_off_the_next_slot():
+    time = Time()
+    ticker = time.ticker()
+    ticker.next()
+    time.time_s += 0.35
+    ticker.sent()
+    assert ticker.next().start_s == pytest.approx(1000.0 + 0.35 + 0.2)
+    time.time_s += 0.45  # on its way until 1.0, which is when slot 2 is 0.2 late and slot 3 not yet due
+    ticker.sent()
+    tick = ticker.next()
+    assert (tick.index, tick.missed) == (3, 1)
+    assert tick.start_s == pytest.approx(1000.0 + 1.2)
