@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.ports import ports_here
@@ -80,6 +81,18 @@ class NDI:
             pass  # a device that is gone cannot be told to stop
 
 
+def matrices(quaternions: NDArray[np.float64], translations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses (n, 4, 4) from unit quaternions (n, 4), w first, and translations (n, 3), mm; NaN stays NaN."""
+    w, x, y, z = quaternions.T
+    poses = np.zeros((len(quaternions), 4, 4))
+    poses[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1)
+    poses[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1)
+    poses[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1)
+    poses[:, :3, 3] = translations
+    poses[:, 3, 3] = 1.0
+    return poses
+
+
 def _checked(kind: str, tools: list[Path], count: int) -> list[Path]:
     """The tool files, as many as there must be, all of them there."""
     if kind == "aurora":
@@ -115,6 +128,15 @@ def _connected(kind: str, port: str, tools: list[Path]) -> Any:
         def _set_use_bx_transforms(self) -> None:
             self._get_frame, self._get_transform = ndicapy.ndiGetTXFrame, ndicapy.ndiGetTXTransform
             self._capture_string = "TX:0801"
+
+        # The client takes means over the frames of a buffer. Ours has one, and that took most of a frame's time.
+        def add_frame_to_buffer(
+            self, handles: Any, times: Any, numbers: Any, rotations: Any, translations: Any, quality: Any, **how: Any
+        ) -> None:
+            self._newest = times, numbers, matrices(np.array(rotations), np.array(translations)), quality
+
+        def get_smooth_frame(self, port_handles: Any) -> Any:
+            return port_handles, *self._newest
 
     settings: dict[str, Any] = {"tracker type": kind, "romfiles": [str(path) for path in tools]}
     if kind == "vega":

@@ -222,3 +222,18 @@ def test_frames_are_asked_for_at_the_devices_pace(monkeypatch, tmp_path):
     for _ in range(61):
         source.read()
     assert clock[0] == pytest.approx(1.0)
+
+
+def test_poses_are_those_that_the_client_itself_would_make():
+    from sksurgerycore.algorithms.tracking_smoothing import quaternion_to_matrix
+
+    rng = np.random.default_rng(3)
+    quaternions = rng.normal(size=(50, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    quaternions[7] = np.nan  # a tool that is not seen
+    translations = rng.normal(size=(50, 3))
+    found = ndi.matrices(quaternions, translations)
+    np.testing.assert_allclose(found[:, :3, :3], [quaternion_to_matrix(q) for q in quaternions], atol=1e-15)
+    np.testing.assert_array_equal(found[:, :3, 3], translations)
+    np.testing.assert_array_equal(found[:, 3], np.tile([0, 0, 0, 1], (50, 1)))
+    assert np.isnan(found[7, :3, :3]).all()
