@@ -43,6 +43,7 @@ LOST_VENT_WAIT_S = 6.0  # a board in its bootloader needs up to 5 s of silence t
 CLEAR_WAIT_S = 1.0
 DOWN_BAR = 0.05  # P_DOWN of firmware/limits.h: above it a chamber is not empty
 DOWN_WAIT_S = 1.0  # for the air to leave, after the valves are at 0
+HAND_OVER_S = 0.002  # ten times what it takes
 
 
 class Port(Protocol):
@@ -80,6 +81,7 @@ class Board:
         self._listened = False
         self._changed = threading.Condition()  # guards the link
         self._stop = threading.Event()
+        self._written = threading.Event()
         self._thread: threading.Thread | None = None
         if threaded:
             self._thread = threading.Thread(target=self._serve, name="board", daemon=True)
@@ -194,8 +196,10 @@ class Board:
             self._wait(lambda: False, self._clock() + ARM_AGAIN_S)
 
     def set_pressures(self, tick: int, pressures_bar: ArrayLike) -> int:
-        """Hand over the set-points (channels,), bar, of this tick and return at once with their sequence number.
+        """Hand over the set-points (channels,), bar, of this tick; returns their sequence number.
 
+        That is when they are written, or 2 ms later: the thread of the port needs the interpreter, so the caller steps
+        aside for it, but a port that takes nothing holds nobody up.
         A shorter row is filled up with 0 (vented). Raises `Tripped` for a value that is no pressure of this robot, and
         what `check` raises.
         """
@@ -209,9 +213,12 @@ class Board:
         if np.any(units < 0) or np.any(units > self._p_max):
             raise Tripped(f"set-points {pressures.tolist()} bar leave the range from 0 to {to_bar(self._p_max):g} bar")
         padded = tuple(units.tolist()) + (0,) * (CHANNELS - len(units))
+        self._written.clear()
         with self._changed:
             sequence = self._link.set(Set(tick & 0xFFFFFFFF, padded))
         self._wake()
+        if self._thread is not None:
+            self._written.wait(HAND_OVER_S)
         return sequence
 
     def beat(self, tick: int) -> None:
@@ -349,6 +356,7 @@ class Board:
                     self._changed.notify_all()
             if out:
                 self._port.write(out)
+                self._written.set()
             if self._link.dtr != self._dtr:
                 self._set_dtr(self._link.dtr)
         except OSError as error:  # pyserial's own errors are OSErrors too

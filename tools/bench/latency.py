@@ -6,8 +6,8 @@ every border; the robot is a swinging row of poses. The stages:
     frame          the client's answer (after the tracker's own line) to a frame in the loop's slot
     configuration  judged, eq. (1), the feature window
     ONNX           the network
-    set-points     limits, eq. (3), pressures, handed to the thread of the port
-    serial         that thread wakes, encodes, writes
+    set-points     limits, eq. (3), pressures
+    serial         checked, handed to the thread of the port, encoded, written
     wire           the set-points' bytes at 250,000 baud
     firmware       from the last byte until the first timer register changes, with what the emulator adds
 
@@ -200,7 +200,7 @@ def stages(
     moved = changes[(changes >= line["pressures"]) & (changes <= written_s + wire_s + REGISTER_WAIT_S)]
     if not len(moved) or moved[0] < written_s + wire_s:
         return None
-    in_loop_s = [line[border] for border in ("taken", "features", "answer", "handed")]
+    in_loop_s = [line[border] for border in ("taken", "features", "answer", "pressures")]
     spans_s = [there_s - answered_s, *np.diff([*in_loop_s, written_s, written_s + wire_s, moved[0]])]
     found = {stage: 1e3 * float(span_s) for stage, span_s in zip(STAGES, spans_s, strict=True)}
     return {**found, "ours": sum(found[stage] for stage in OURS), "all": sum(found.values())}
