@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import descendants
 
 from modsoft.hil import emulator, judge, record
 from modsoft.hil.polaris import write_tool_files
@@ -33,15 +34,6 @@ def script(name, *arguments, **options):
         **options,
     )  # fmt: skip
     return done.returncode, done.stderr.strip()
-
-
-def descendants(pid):
-    """Process ids below `pid`."""
-    found = []
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        for child in map(int, task.read_text().split()):
-            found += [child, *descendants(child)]
-    return found
 
 
 def alive(pid):

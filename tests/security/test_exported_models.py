@@ -1,6 +1,5 @@
 """An ONNX model from a stranger reads nothing but itself, and is refused in one line."""
 
-import json
 import os
 
 import numpy as np
@@ -8,6 +7,7 @@ import onnx
 import onnxruntime
 import pytest
 from onnx import TensorProto, helper
+from spoilt_models import onnx_description, sealed_at
 
 from modsoft.export import cli as export_cli
 from modsoft.export import inspection
@@ -15,14 +15,6 @@ from modsoft.hil import cli as hil_cli
 from modsoft.runtime import artefact
 from modsoft.runtime import cli as runtime_cli
 from modsoft.runtime.controller import Controller
-
-
-def resealed(model):
-    """Bytes of a changed model whose seal holds: it finds damage, it does not prove who made a file."""
-    (entry,) = (entry for entry in model.metadata_props if entry.key == artefact.METADATA_KEY)
-    seal = artefact._SEAL.search(entry.value.encode())[1].decode()
-    entry.value = entry.value.replace(seal, artefact.UNSEALED)
-    return artefact.sealed(model.SerializeToString())
 
 
 def largest_weight(model):
@@ -63,11 +55,11 @@ def test_a_model_with_weights_in_another_file(tmp_path, monkeypatch, model_file,
     monkeypatch.chdir(tmp_path)
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
     tensors = in_a_branch(model) if place == "branch" else [largest_weight(model)]
-    path.write_bytes(resealed(model))
+    sealed_at(path, model, onnx_description(model))
     Controller.load(path)  # so far it is only an odd model
     for tensor in tensors:
         outside(tensor, location.format(folder=tmp_path, name=tmp_path.name))
-    path.write_bytes(resealed(model))
+    sealed_at(path, model, onnx_description(model))
     refused(Controller.load, path, "onnxruntime .* refuses it")
 
 
@@ -83,7 +75,7 @@ def test_the_commands_end_with_65(tmp_path, monkeypatch, model_file, main, befor
     monkeypatch.chdir(tmp_path)
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
     outside(largest_weight(model), "/etc/hostname")
-    path.write_bytes(resealed(model))
+    sealed_at(path, model, onnx_description(model))
     before_it = set(tmp_path.iterdir())
     code, said = ended(main, *before, path, *after)
     assert (code, len(said)) == (65, 1), said
@@ -94,18 +86,13 @@ def test_what_a_model_says_does_not_command_the_terminal(tmp_path, model_file, e
     """Of all texts, those of the provenance are free."""
     clear = "\x1b[2J"
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
-    (entry,) = model.metadata_props
-    said = json.loads(entry.value)
-    said["provenance"] = {"seed": f"1{clear}"}
-    entry.value = json.dumps(said, separators=(",", ":"))
-    path.write_bytes(resealed(model))
+    said = {**onnx_description(model), "provenance": {f"seed{clear}": f"1{clear}"}}
+    sealed_at(path, model, said)
     inspection.print_model(path)
     out = capfd.readouterr().out
-    assert "1\\x1b[2J" in out
+    assert "seed\\x1b[2J: 1\\x1b[2J" in out
     assert "\x1b" not in out
-    said["kind"] = clear
-    entry.value = json.dumps(said, separators=(",", ":"))
-    path.write_bytes(resealed(model))
+    sealed_at(path, model, {**said, "kind": clear})
     code, lines = ended(export_cli.main, "--inspect", path)
     assert (code, len(lines), "\x1b" in lines[0]) == (65, 1, False)
 
@@ -117,7 +104,7 @@ def test_a_model_with_weights_at_an_address_of_the_memory(tmp_path, monkeypatch,
     numbers = np.frombuffer(tensor.raw_data, dtype=np.uint8).copy()
     outside(tensor, "weights.bin")
     tensor.external_data[0].value, tensor.external_data[1].value = "*/_ORT_MEM_ADDR_/*", str(numbers.ctypes.data)
-    path.write_bytes(resealed(model))
+    sealed_at(path, model, onnx_description(model))
     refused(Controller.load, path, "onnxruntime .* refuses it")
 
 
