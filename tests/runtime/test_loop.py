@@ -8,7 +8,13 @@ from virtual_loop import PERIOD_S, ROBOT, World
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.actuation import channel_pressures_bar
-from modsoft.runtime.configuration import Window, bending_angle_deg, state_of
+from modsoft.runtime.configuration import (
+    Window,
+    bending_angle_deg,
+    episode_features,
+    feature_names,
+    state_of,
+)
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
 from modsoft.runtime.log import plain
 from modsoft.runtime.loop import Loop
@@ -379,3 +385,46 @@ def test_status_line():
         "step 5/5  2.50 Hz  late 0 missed 0  tracker 20 ms 4/4  a +0.10 +0.10 +0.10  bar 0.11|0.08"
     )
     assert status.endswith("ack 7.0 ms")
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.sampled_from(["good", "good", "hidden", "slow", "stall"]), min_size=3, max_size=15))
+def test_whatever_happens_the_model_sees_what_an_episode_of_training_has(happens):
+    """A held frame repeats the state; a step that sent nothing, or that was skipped, repeats the action."""
+    world = World(steps=len(happens))
+    rng = np.random.default_rng(len(happens))
+
+    def turn(what):
+        world.angles = tuple(rng.uniform(-5, 5, 3))
+        world.hide(*[2] if what == "hidden" else [])
+        world.slow = what == "slow"
+        if what == "stall":
+            world.time_s += 1.3 * PERIOD_S
+
+    def answer(features):
+        world.time_s += 0.25 if world.slow else 0.0
+        return rng.uniform(-0.3, 0.3, (3, 1))
+
+    world.answer = answer
+    world.at = {step: lambda what=what: turn(what) for step, what in enumerate(happens)}
+    try:
+        world.run()
+    except (Tripped, LostInRun):
+        pass  # three in a row: what came before is looked at
+    # as an episode, the period at actuation 0 before step 0 included; the slots that nothing came of are held
+    states, actions = [state_of(REST, "pneumatic")], [np.zeros((3, 1))]
+    for line in world.ticks:
+        for _ in range(line["missed"]):
+            states.append(states[-1])
+            actions.append(actions[-1])
+        good = line["configuration"] is not None
+        states.append(state_of(line["configuration"], "pneumatic") if good else states[-1])
+        actions.append(line["actuation"])
+    rows = episode_features(np.array([*states, states[-1]]), np.array(actions), world.history)
+    desired = [name.endswith("[desired]") for name in feature_names("pneumatic", world.history)]
+    asked = [line for line in world.ticks if line["raw"] is not None]
+    assert len(asked) == len(world.features)
+    for line, found in zip(asked, world.features, strict=True):
+        row = rows[line["tick"] + 1]
+        row[:, desired] = state_of(line["aim"], "pneumatic")
+        np.testing.assert_allclose(found, row, atol=1e-12)
