@@ -72,10 +72,30 @@ def test_an_odd_episode_is_made_again(tmp_path, parts, attack):
 
 def test_a_pickle_among_the_episodes_is_not_run(tmp_path, parts, mark, evil):
     np.savez(parts / "episode-000000.npz", configuration=np.array([evil]), action=np.zeros((10, 2, 1)), redrawn=0)
-    (parts / "jobs").mkdir()
-    (parts / "jobs" / "1_0_result.pkl").write_bytes(pickle.dumps(("success", evil)))
     collected(tmp_path / "d.h5")
     assert not mark.exists()
+
+
+def test_results_of_jobs_that_were_there_before_are_not_unpickled(tmp_path, parts, mark, evil, monkeypatch):
+    """submitit unpickles NUMBER_0_result.pkl, and the numbers of a cluster can be foreseen."""
+    submitit = pytest.importorskip("submitit", reason="extra slurm")
+    folders = []
+
+    def caught(executor, chunk, chunks):
+        folders.append(Path(executor.folder))
+        raise InUse("caught")
+
+    monkeypatch.setattr(submitit.AutoExecutor, "map_array", caught)
+    for _ in range(2):
+        for there in folders:  # what a stranger may know of an earlier run
+            there.mkdir(parents=True)
+            (there / "1_0_result.pkl").write_bytes(pickle.dumps(("success", evil)))
+        with pytest.raises(InUse, match="caught"):
+            collect.collect(ROBOT, tmp_path / "d.h5", 20, "random", 0, 10, plant=Plant("still", still, 1),
+                            backend="submitit", options={"cluster": "local"})  # fmt: skip
+    assert folders[0] != folders[1]
+    assert len(folders[1].name) > 32
+    assert not folders[1].exists()
 
 
 def test_links_are_not_followed(tmp_path, parts, private, refused):
