@@ -2,6 +2,7 @@
 
 #include <avr/io.h>
 #include <avr/wdt.h>
+#include <stdbool.h>
 
 #include "frame.h"
 
@@ -17,7 +18,7 @@ static struct {
 } memory __attribute__((section(".noinit")));
 static uint8_t flags_at_reset __attribute__((section(".noinit")));
 static uint32_t millis_at_reset __attribute__((section(".noinit")));
-static uint8_t survived, starved;
+static bool survived, starved;
 
 extern volatile unsigned long timer0_millis; /* what the core's millis() counts in */
 

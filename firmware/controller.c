@@ -5,7 +5,7 @@
 #include "limits.h"
 #include "pins.h"
 
-static uint8_t in_session(const struct controller *c) { return c->state == STATE_ARMED || c->state == STATE_RUNNING; }
+static bool in_session(const struct controller *c) { return c->state == STATE_ARMED || c->state == STATE_RUNNING; }
 
 /* ---- To the host ------------------------------------------------------------------------------------------- */
 
@@ -74,16 +74,16 @@ static void latch(struct controller *c, uint16_t fault) {
   }
 }
 
-static uint8_t pressures_down(const struct controller *c) {
+static bool pressures_down(const struct controller *c) {
   if (!output_is_vented(&c->output)) {
-    return 0;
+    return false;
   }
   for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
     if (c->measured[channel] >= P_DOWN) { /* "not measured" is the most negative number there is */
-      return 0;
+      return false;
     }
   }
-  return 1;
+  return true;
 }
 
 static void feed_link(struct controller *c, uint32_t now_ms) { c->last_valid_ms = now_ms; }
@@ -193,7 +193,7 @@ static void on_heartbeat(struct controller *c, const struct frame *frame, uint32
   }
   if (!c->hears_heartbeats || now_ms - c->last_heartbeat_ms > LINK_TIMEOUT_MS) {
     c->heartbeats_since_ms = now_ms;
-    c->hears_heartbeats = 1;
+    c->hears_heartbeats = true;
   }
   c->last_heartbeat_ms = now_ms;
 }
@@ -274,10 +274,10 @@ static uint8_t check_control(struct controller *c, uint32_t now_ms) {
   return CHECK_CONTROL;
 }
 
-/* Counts how long something has been the case; 1 once it has been for limit_ms, and then counts anew. */
-static uint8_t lasts(uint16_t *counted_ms, uint8_t is, uint32_t elapsed_ms, uint16_t limit_ms) {
+/* Counts how long something has been the case; true once it has been for limit_ms, and then counts anew. */
+static bool lasts(uint16_t *counted_ms, bool is, uint32_t elapsed_ms, uint16_t limit_ms) {
   uint32_t lasted_ms = is ? *counted_ms + elapsed_ms : 0;
-  uint8_t too_long = lasted_ms >= limit_ms;
+  bool too_long = lasted_ms >= limit_ms;
   *counted_ms = too_long ? 0 : (uint16_t)lasted_ms;
   return too_long;
 }
@@ -286,7 +286,7 @@ static uint8_t check_sensors(struct controller *c, uint32_t elapsed_ms) {
   for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
     int16_t measured = c->measured[channel];
     int16_t off;
-    uint8_t driven;
+    bool driven;
     if (measured == PROTOCOL_NOT_MEASURED) {
       continue;
     }
@@ -327,27 +327,27 @@ void controller_init(struct controller *c, uint32_t boot_id, uint8_t reset_cause
 }
 
 /* Not inlined: a byte that ends no frame need not pay for the room that the answers take on the stack. */
-__attribute__((noinline)) static uint8_t on_delimiter(struct controller *c, uint32_t now_ms) {
+__attribute__((noinline)) static bool on_delimiter(struct controller *c, uint32_t now_ms) {
   struct frame frame;
   switch (frame_end(&c->parser, &frame)) {
     case FRAME_GOOD:
       c->rx_good++;
       on_frame(c, &frame, now_ms);
-      return 1;
+      return true;
     case FRAME_BAD:
       c->rx_bad++;
-      return 0;
+      return false;
     default:
-      return 0;
+      return false;
   }
 }
 
-uint8_t controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms) {
+bool controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms) {
   if (byte == PROTOCOL_DELIMITER) {
     return on_delimiter(c, now_ms);
   }
   frame_take(&c->parser, byte);
-  return 0;
+  return false;
 }
 
 uint8_t controller_update(struct controller *c, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,

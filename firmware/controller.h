@@ -8,6 +8,7 @@
 #ifndef CONTROLLER_H
 #define CONTROLLER_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "frame.h"
@@ -35,7 +36,7 @@ struct controller {
   uint32_t set_tick;       /* of the last SET accepted */
   int16_t set_points[PROTOCOL_CHANNELS];
 
-  uint8_t hears_heartbeats;
+  bool hears_heartbeats;
   uint32_t heartbeats_since_ms; /* unbroken since */
   uint32_t last_heartbeat_ms;
   uint32_t last_valid_ms;    /* last frame that feeds the link timer */
@@ -59,8 +60,8 @@ struct controller {
 /* Starts vented, in BOOT, with the HELLO already queued. */
 void controller_init(struct controller *c, uint32_t boot_id, uint8_t reset_cause, uint32_t now_ms);
 
-/* One byte from the host. Returns 1 when it ended a good frame, which has been carried out or refused then. */
-uint8_t controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms);
+/* One byte from the host. Returns true when it ended a good frame, which has been carried out or refused then. */
+bool controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms);
 
 /* Once a loop: timers, faults, outputs, STATUS. measured is in 10 Pa, PROTOCOL_NOT_MEASURED where there is no sensor.
  * Returns the checks done, CHECK_ALL when all is well; then, and only then, the watchdog may be fed. */

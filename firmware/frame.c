@@ -30,12 +30,12 @@ static void append(struct frame_parser *parser, uint8_t byte) {
   if (parser->length < PROTOCOL_MAX_DECODED) {
     parser->decoded[parser->length++] = byte;
   } else {
-    parser->broken = 1;
+    parser->broken = true;
   }
 }
 
 void frame_take(struct frame_parser *parser, uint8_t byte) {
-  parser->started = 1;
+  parser->started = true;
   if (parser->broken) {
     return;
   }
@@ -49,7 +49,7 @@ void frame_take(struct frame_parser *parser, uint8_t byte) {
     append(parser, 0);
   }
   parser->remaining = (uint8_t)(byte - 1);
-  parser->zero_pending = 1;
+  parser->zero_pending = true;
 }
 
 enum frame_event frame_end(struct frame_parser *parser, struct frame *frame) {
@@ -69,9 +69,9 @@ enum frame_event frame_end(struct frame_parser *parser, struct frame *frame) {
   }
   parser->length = 0;
   parser->remaining = 0;
-  parser->zero_pending = 0;
-  parser->started = 0;
-  parser->broken = 0;
+  parser->zero_pending = false;
+  parser->started = false;
+  parser->broken = false;
   return event;
 }
 

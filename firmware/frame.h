@@ -2,6 +2,7 @@
 #ifndef FRAME_H
 #define FRAME_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "protocol.h"
@@ -24,9 +25,9 @@ enum frame_event { FRAME_NONE, FRAME_GOOD, FRAME_BAD };
 struct frame_parser {
   uint8_t length; /* of what is decoded so far */
   uint8_t remaining;    /* bytes of the current COBS run still to come */
-  uint8_t zero_pending; /* the last run ends in a zero, unless the frame ends first */
-  uint8_t started;      /* something came since the last delimiter */
-  uint8_t broken;       /* too long: dropped up to the next delimiter */
+  bool zero_pending; /* the last run ends in a zero, unless the frame ends first */
+  bool started;      /* something came since the last delimiter */
+  bool broken;       /* too long: dropped up to the next delimiter */
   uint8_t decoded[PROTOCOL_MAX_DECODED];
 };
 

@@ -19,7 +19,9 @@
 #define P_MAX 3500
 
 /* Fastest change of any output, in 10 Pa per second (20000 is 2 bar/s): set-points and ramped venting alike. */
+#ifndef SLEW
 #define SLEW 20000U
+#endif
 
 /* Sensors: 0 V is no pressure, 5 V is this one, linear between. Which channels have one is said in pins.h. */
 #define SENSOR_FULL 10000L

@@ -2,6 +2,7 @@
 #ifndef OUTPUT_H
 #define OUTPUT_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "protocol.h"
@@ -15,14 +16,15 @@ struct output_stage {
   uint16_t remainder;                 /* part of a slew step not yet spent, 10 Pa / 1000 */
 };
 
-/* Moves every channel towards its target, clamped to 0 .. P_MAX, by no more than the slew limit allows in elapsed_ms. */
+/* Moves every channel towards its target, clamped to 0 .. P_MAX, by no more than the slew limit allows in elapsed_ms. Channels
+ * from CHANNELS_USED on stay at 0. */
 void output_step(struct output_stage *stage, const int16_t targets[PROTOCOL_CHANNELS], uint32_t elapsed_ms);
 
 /* All channels to 0 at once. */
 void output_dump(struct output_stage *stage);
 
-/* 1 where every channel is at 0. */
-uint8_t output_is_vented(const struct output_stage *stage);
+/* True where every channel is at 0. */
+bool output_is_vented(const struct output_stage *stage);
 
 /* PWM counts, 0 to PWM_COUNTS, of a channel; 0 stands for "disconnected". */
 uint16_t output_counts(const struct output_stage *stage, uint8_t channel);

@@ -1,5 +1,7 @@
 #include "sensors.h"
 
+#include <stdbool.h>
+
 #include <avr/io.h>
 
 #include "limits.h"
@@ -17,7 +19,7 @@
 #define ROUNDS_PER_SUPPLY 64
 #define REFERENCE_MV 1100UL
 
-static uint8_t has_sensor(uint8_t input) { return (SENSORS >> input) & 1; }
+static bool has_sensor(uint8_t input) { return (SENSORS >> input) & 1; }
 
 static void start(uint8_t input) {
   const uint8_t reference_input = _BV(MUX4) | _BV(MUX3) | _BV(MUX2) | _BV(MUX1);

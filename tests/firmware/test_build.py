@@ -29,7 +29,7 @@ def test_builds_for_the_mega_and_is_small():
 @pytest.mark.parametrize("name", ["frame.c", "output.c", "controller.c"])
 def test_logic_includes_no_hardware(name):
     includes = re.findall(r"#include\s+([<\"].*?[>\"])", (FIRMWARE / name).read_text())
-    allowed = {"<stdint.h>", "<string.h>", '"protocol.h"', '"frame.h"', '"output.h"', '"controller.h"'}
+    allowed = {"<stdbool.h>", "<stdint.h>", "<string.h>", '"protocol.h"', '"frame.h"', '"output.h"', '"controller.h"'}
     assert set(includes) <= allowed | {'"limits.h"', '"pins.h"'}
 
 

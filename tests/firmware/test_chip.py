@@ -169,6 +169,17 @@ def test_pressures(chip):
     assert list(sensors.measured) == [0, 10, 996, 5000, 9980, 9990] + [NOT_MEASURED] * 6
 
 
+def test_without_sensors_the_supply_is_measured_all_the_time(native, tmp_path):
+    if not (native / "libsensorless.so").exists():
+        pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
+    chip = Chip(shutil.copy(native / "libsensorless.so", tmp_path))
+    sensors = begin(chip)
+    assert {convert(chip, sensors, 225) for _ in range(500)} == {REFERENCE}
+    assert sensors.supply_mv == 1100 * 1024 // 225
+    assert list(sensors.measured) == [NOT_MEASURED] * 12
+    assert chip.registers[DIDR0] == 0
+
+
 # ---- reset
 
 

@@ -84,7 +84,7 @@ static struct sent next_set(uint8_t ahead) {
   return next;
 }
 
-static uint8_t is_applied(const struct sent *frame) {
+static bool is_applied(const struct sent *frame) {
   const struct controller *board = &host.board;
   return board->state == STATE_RUNNING && board->last_seq == frame->seq && board->set_tick == frame->set.tick &&
          !memcmp(board->set_points, frame->set.pressures, sizeof board->set_points);
@@ -154,7 +154,7 @@ static void try_repeated(void) {
 
 static void pass(void) {
   watched_pass(&host, 1);
-  watched_follow(&host, 1);
+  watched_follow(&host, true);
 }
 
 /* Nothing comes any more: the board has to vent by itself. */

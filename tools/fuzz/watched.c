@@ -9,7 +9,7 @@
 
 #define STALL_MS 20 /* more than this is not caught up with, see output.c */
 
-static void must(const struct watched *w, int holds, const char *rule) {
+static void must(const struct watched *w, bool holds, const char *rule) {
   if (!holds) {
     fprintf(stderr, "broken at %u ms in state %u, faults %u: %s\n", (unsigned)w->now_ms, w->board.state,
             w->board.faults, rule);
@@ -17,9 +17,9 @@ static void must(const struct watched *w, int holds, const char *rule) {
   }
 }
 
-void watched_follow(struct watched *w, uint8_t yes) {
+void watched_follow(struct watched *w, bool yes) {
   for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
-    uint8_t sensed = (SENSORS >> channel) & 1;
+    bool sensed = (SENSORS >> channel) & 1;
     w->measured[channel] = !sensed ? PROTOCOL_NOT_MEASURED : yes ? w->board.output.applied[channel] : 0;
   }
 }
@@ -29,11 +29,11 @@ void watched_begin(struct watched *w, uint32_t now_ms) {
   memset(&w->board, 0xa5, sizeof w->board); /* as memory is after power-on */
   w->now_ms = now_ms;
   controller_init(&w->board, BOOT_ID, RESET_CAUSE_POWER_ON, now_ms);
-  watched_follow(w, 0);
+  watched_follow(w, false);
   watched_pass(w, 0);
 }
 
-uint8_t watched_receive(struct watched *w, uint8_t byte) { return controller_receive(&w->board, byte, w->now_ms); }
+bool watched_receive(struct watched *w, uint8_t byte) { return controller_receive(&w->board, byte, w->now_ms); }
 
 void watched_pass(struct watched *w, uint32_t elapsed_ms) {
   struct controller *board = &w->board;
@@ -46,7 +46,7 @@ void watched_pass(struct watched *w, uint32_t elapsed_ms) {
   w->now_ms += elapsed_ms;
   must(w, controller_update(board, w->measured, 5000, w->now_ms) == CHECK_ALL, "a pass left a check out");
 
-  uint8_t running = board->state == STATE_RUNNING;
+  bool running = board->state == STATE_RUNNING;
   must(w, (board->state == STATE_FAULT) == (board->faults != 0), "a fault is not latched, or nothing is wrong in FAULT");
   must(w, !(board->faults & FAULT_OVER_PRESSURE) || output_is_vented(&board->output), "over-pressure, and not dumped");
   if (running || board->state == STATE_ARMED) {
@@ -57,7 +57,7 @@ void watched_pass(struct watched *w, uint32_t elapsed_ms) {
   }
   for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
     int32_t was = before[channel], is = now[channel];
-    uint8_t driven = running && (board->channels >> channel & 1);
+    bool driven = running && (board->channels >> channel & 1);
     must(w, is >= 0 && is <= P_MAX, "an output beyond the limit");
     must(w, channel < CHANNELS_USED || is == 0, "an output that is not there");
     must(w, is <= was + step + 1, "an output rises faster than SLEW");
@@ -87,7 +87,7 @@ void watched_run(struct watched *w, int16_t pressure) {
                     (1 << CHANNELS_USED) - 1, P_FULL};
   struct set set = {board->tick, {0}};
   watched_send(w, MESSAGE_VENT, 0, 0, &dump, sizeof dump);
-  watched_follow(w, 0);
+  watched_follow(w, false);
   watched_pass(w, 1);
   clear.mask = board->faults;
   watched_send(w, MESSAGE_CLEAR_FAULT, 0, 0, &clear, sizeof clear);

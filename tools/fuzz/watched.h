@@ -19,8 +19,8 @@ struct watched {
 /* Powers up, vented, the sensors reading 0. */
 void watched_begin(struct watched *w, uint32_t now_ms);
 
-/* One byte arrives. Returns 1 where it ended a good frame. */
-uint8_t watched_receive(struct watched *w, uint8_t byte);
+/* One byte arrives. Returns true where it ended a good frame. */
+bool watched_receive(struct watched *w, uint8_t byte);
 
 /* Time passes, then one pass of the firmware's loop. Aborts, with one line, where a rule is broken: a byte since the last
  * pass moved an output, but to 0; an output leaves 0 .. P_MAX, moves faster than SLEW, or does not fall at SLEW outside
@@ -28,7 +28,7 @@ uint8_t watched_receive(struct watched *w, uint8_t byte);
 void watched_pass(struct watched *w, uint32_t elapsed_ms);
 
 /* Sensors read what is applied now, or 0. */
-void watched_follow(struct watched *w, uint8_t yes);
+void watched_follow(struct watched *w, bool yes);
 
 /* A whole frame as a host would send it arrives. */
 void watched_send(struct watched *w, uint8_t type, uint8_t seq, uint8_t session, const void *payload, uint8_t length);
