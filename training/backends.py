@@ -19,6 +19,7 @@ import os
 import secrets
 import shutil
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -57,14 +58,26 @@ def by_submitit(jobs: int, folder: Path, options: Options) -> Iterator[Deal]:
     cluster = asked.pop("cluster", "slurm")
     if cluster == "slurm" and shutil.which("sbatch") is None:
         raise DeviceAbsent("no SLURM here: sbatch is not on the path; run on a login node, or use --backend local")
-    # submitit unpickles what it finds there: nothing that somebody put there before
-    unknown = folder / f"jobs-{secrets.token_hex(16)}"
+    with tempfile.TemporaryDirectory() as nowhere:  # an executor makes its folder; this one only proves the options
+        _executor(submitit, Path(nowhere), cluster, asked)
+
+    def deal(task: Task, bundles: list[Bundle]) -> Iterator[None]:
+        if not bundles:
+            return iter(())
+        # submitit unpickles what it finds there: nothing that somebody put there before
+        unknown = folder / f"jobs-{secrets.token_hex(16)}"
+        return _through_jobs(_executor(submitit, unknown, cluster, asked), cluster, task, bundles, jobs)
+
+    yield deal
+
+
+def _executor(submitit: Any, folder: Path, cluster: str, asked: Options) -> Any:
     try:
-        executor = submitit.AutoExecutor(folder=unknown, cluster=cluster)
+        executor = submitit.AutoExecutor(folder=folder, cluster=cluster)
         executor.update_parameters(**asked)
     except (NameError, TypeError, ValueError) as error:
         raise _refused(error) from error
-    yield lambda task, bundles: _through_jobs(executor, cluster, task, bundles, jobs) if bundles else iter(())
+    return executor
 
 
 def _refused(error: BaseException) -> UsageError:
