@@ -31,7 +31,7 @@ from modsoft.hil.soak import Soak, SoakRig
 from modsoft.runtime import log
 from modsoft.runtime.command import entry
 from modsoft.runtime.controller import Controller
-from modsoft.runtime.errors import UsageError
+from modsoft.runtime.errors import LostInRun, UsageError
 from modsoft.runtime.files import written
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,6 +80,8 @@ def page(soak: Soak, about: dict[str, str]) -> tuple[str, bool]:
     wrong_runs = [f"run {ran.number}: {word}" for ran in runs for word in ran.wrong]
     wrong_faults = [each for each in faults if each.wrong]
     grew = growth is not None and growth > GROWTH_MIB_PER_H
+    vents = [ran.vented_ms for ran in runs if ran.vented_ms is not None and ran.code != LostInRun.exit_code]
+    stalled_s, seconds = 1e-3 * sum(ran.stalled_ms for ran in runs), sum(ran.seconds for ran in runs)
     lines = ["# The soak", ""]
     lines += [f"- {name}: {value}" for name, value in about.items()]
     lines += ["", f"{sum(ran.ticks for ran in runs)} control ticks in {len(runs)} runs, {len(faults)} faults of "
@@ -89,6 +91,10 @@ def page(soak: Soak, about: dict[str, str]) -> tuple[str, bool]:
         f"- Valve outputs, by the timer registers, against the set-points of the log at all times: at most "
         f"{max(ran.over_counts for ran in runs):.1f} counts of 4096 above, {max(ran.under_counts for ran in runs):.1f} "
         f"below, {max(ran.off_counts for ran in runs):.1f} off once settled (1 is rounding).",
+        f"- Every valve at 0 at most {max(vents, default=math.nan):.0f} ms of the board's clock after the runtime "
+        f"began to vent, where it still had the board.",
+        f"- The emulated board stood still for {stalled_s:.1f} s of {seconds / 60:.0f} minutes, while the machine was busy "
+        "with other things.",
         f"- Every run and its log as it must be: {'yes' if not wrong_runs else '**no**'}.",
         *(f"    - {word}" for word in wrong_runs),
         "- Memory of the longest run: " + memory(longest, growth) + (" **Too much.**" if grew else ""),

@@ -12,7 +12,7 @@ import pytest
 from flawless import COUNTS, flawless_run, slewed, told
 
 from modsoft.hil import soak as soaks
-from modsoft.hil.aftermath import Injected, Ran, judge_fault, judge_log, judge_valves
+from modsoft.hil.aftermath import Injected, Ran, judge_fault, judge_log, judge_valves, judge_vent
 from modsoft.hil.faults import FAULTS, Log
 from modsoft.runtime import log as logs
 
@@ -143,6 +143,23 @@ def test_a_valve_left_open_and_one_opened_too_early_are_found(flawless):
     assert "a valve was left open" in judged(replace(flawless, valves=left))
     early = told(flawless, flawless.start_ns - 2 * 10**9, flawless.start_ns - 10**9, 1)
     assert "a valve was open before the first set-point" in judged(replace(flawless, valves=early))
+
+
+@pytest.mark.parametrize(
+    ("code", "zero_ms", "wrong"),
+    [
+        (130, 10_200, False),
+        (130, 10_300, True),  # the ramp takes 175 ms
+        (74, 10_600, False),  # the board was lost, and told nothing
+        (74, 10_701, True),
+        (79, None, True),
+    ],
+)
+def test_the_vent_takes_as_long_as_the_ramp_or_the_board_alone(flawless, code, zero_ms, wrong):
+    board = events((9_900, 0.1), *([] if zero_ms is None else [(zero_ms, 0.0)]))
+    ran = Ran(1, code=code)
+    judge_vent(ran, replace(flawless, end_ns=10_000 * 10**6), board)
+    assert bool(ran.wrong) == wrong
 
 
 # ---- The log

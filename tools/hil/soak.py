@@ -194,6 +194,8 @@ class Soak:
         alone = last if last and (last.fault.vents_ms is not None or last.fault.goes_by) else None
         found = record.read(folder, run, rig.robot, str(self._task), self._desired, ran.code)
         aftermath.judge_valves(ran, found, None if alone is None else alone.mono_ns)
+        aftermath.judge_vent(ran, found, events)
+        ran.stalled_ms = 1e-3 * sum(event["late_us"] for event in events if event["event"] == "late")
 
 
 def resident_mib(pid: int) -> float:
