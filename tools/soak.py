@@ -26,7 +26,7 @@ import click
 from modsoft.hil import shipped
 from modsoft.hil.aftermath import Injected, Ran
 from modsoft.hil.emulator import build, choose
-from modsoft.hil.record import board_in_words
+from modsoft.hil.record import board_in_words, firmware_sha256
 from modsoft.hil.soak import Soak, SoakRig
 from modsoft.runtime import log
 from modsoft.runtime.command import entry
@@ -93,8 +93,8 @@ def page(soak: Soak, about: dict[str, str]) -> tuple[str, bool]:
         f"below, {max(ran.off_counts for ran in runs):.1f} off once settled (1 is rounding).",
         f"- Every valve at 0 at most {max(vents, default=math.nan):.0f} ms of the board's clock after the runtime "
         f"began to vent, where it still had the board.",
-        f"- The emulated board stood still for {stalled_s:.1f} s of {seconds / 60:.0f} minutes, while the machine was busy "
-        "with other things.",
+        f"- The emulated board stood still for {stalled_s:.1f} s of {seconds / 60:.0f} minutes, while the machine was "
+        "busy with other things.",
         f"- Every run and its log as it must be: {'yes' if not wrong_runs else '**no**'}.",
         *(f"    - {word}" for word in wrong_runs),
         "- Memory of the longest run: " + memory(longest, growth) + (" **Too much.**" if grew else ""),
@@ -148,6 +148,7 @@ def cli(
         "made by": f"`tools/soak.py --minutes {minutes:g} --every {every_s:g} --seed {seed}`, {began:%Y-%m-%d}",
         "on": f"{host['system']}, {host['cores']} cores",
         "board": board_in_words(board.board),
+        "firmware, SHA-256": firmware_sha256(board.board),
         "robot, task": f"{ROBOT}, {TASK}, again and again",
     }
     text, good = page(soak, about)
