@@ -38,16 +38,14 @@ def data(tmp_path_factory):
 
 
 def test_both_ways_train_on_the_same_samples_until_both_are_there(bench, data):
-    race = bench.Race(str(data), 300, layers=1, hidden=16, iterations=400, target_percent=20.0, seed=0)
+    race = bench.Race(str(data), 300, 1, hidden=16, iterations=100, target_percent=24.0, seed=0, authors_check=40)
     found = bench.raced(race, minutes=4.0, turn_s=0.5)
     for way in bench.WAYS:
-        assert found[way]["best_percent"] <= 20.0
+        assert found[way]["best_percent"] <= 24.0  # a guess is 25
         assert found[way]["seconds_to_target"] == found[way]["seconds"] > 0
         rates = found[way]["samples_per_s"], found[way]["iterations_per_s"]
         assert rates[0] == pytest.approx(found[way]["batch"] * rates[1])
-    # The authors look every 500 iterations, ours twenty times a run.
-    assert found["authors"]["iterations"] == 500
-    assert found["ours"]["iterations"] % 20 == 0
+    assert found["authors"]["iterations"] in (40, 80, 120, 160)  # it looked then
     expected = found["authors"]["seconds"] / found["ours"]["seconds"]
     assert found["ratios"]["time_to_target"] == pytest.approx(expected)
     assert not found["ratio_is_lower_bound"]

@@ -14,11 +14,11 @@ beside it on the other core and is not counted.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
 import platform
-import signal
 import subprocess
 import sys
 import tempfile
@@ -40,7 +40,6 @@ from modsoft.training.networks import BiLSTM
 
 TABLE_1_PERCENT = (1.63, 1.49, 1.11, 0.70)  # biLSTM, modules 1 to 4
 SAMPLES, STEPS = 16_000, 1000  # the paper's; control steps in an episode
-AUTHORS_CHECK = 500  # iterations between looks at the validation error
 TURN_S = 5.0
 WAYS = ("ours", "authors")
 
@@ -56,6 +55,7 @@ class Race:
     iterations: int  # of ours
     target_percent: float  # validation error, mean over the modules
     seed: int
+    authors_check: int = 500  # iterations between their looks at the validation error
 
 
 def first_samples(data: DataSet, samples: int) -> DataSet:
@@ -64,10 +64,24 @@ def first_samples(data: DataSet, samples: int) -> DataSet:
     return dataclasses.replace(data, configuration=data.configuration[:episodes], action=data.action[:episodes])
 
 
-def tell(iteration: int, validation_percent: float, batch: int) -> None:
-    """A line to the referee; it waits here while it is the other's turn."""
-    state = {"iteration": iteration, "percent": validation_percent, "batch": batch, "cpu_s": time.process_time()}
-    print(json.dumps(state), flush=True)
+class Turns:
+    """The runner's end of its pipes: it tells how far it is, and waits at the end of its turn for the next."""
+
+    def __init__(self, batch: int):
+        self.batch = batch
+        self.end_s = 0.0  # the first turn is yet to come
+
+    def tell(self, iteration: int, validation_percent: float) -> None:
+        """After every step of the optimiser; `validation_percent` is the best so far."""
+        waits = time.monotonic() >= self.end_s
+        if waits or iteration % 20 == 0:
+            state = {"iteration": iteration, "percent": validation_percent, "batch": self.batch, "waits": waits}
+            print(json.dumps(state | {"cpu_s": time.process_time()}), flush=True)
+        if waits:
+            granted = sys.stdin.readline()
+            if not granted:  # the race is over
+                raise SystemExit
+            self.end_s = time.monotonic() + float(granted)
 
 
 def ours(race: Race, data: DataSet) -> None:
@@ -79,14 +93,16 @@ def ours(race: Race, data: DataSet) -> None:
         seed=race.seed,
     )
 
-    def progress(told: train.Progress) -> None:
-        if told.iteration == 1 or told.iteration % 20 == 0:
-            tell(told.iteration, told.validation_percent, settings.batch)
-
+    turns = Turns(settings.batch)
     with tempfile.TemporaryDirectory() as folder:
-        made = train.train(data, Path(folder) / "model.pt", settings, progress)
-    said = made["provenance"]
-    tell(said["iterations_done"], said["validation_percent"], settings.batch)
+        made = train.train(
+            [data],
+            Path(folder) / "model.pt",
+            settings,
+            lambda told: turns.tell(told.iteration, told.validation_percent),
+        )
+    turns.end_s = 0.0  # the last look at the validation error came after the last step was told
+    turns.tell(made["provenance"]["iterations_done"], made["provenance"]["validation_percent"])
 
 
 class WindowSet(torch.utils.data.Dataset[tuple[np.ndarray, np.ndarray]]):
@@ -111,17 +127,16 @@ def authors(race: Race, data: DataSet) -> None:
     network = BiLSTM(training.features.shape[-1], training.targets.shape[-1], race.layers, race.hidden, dropout=0.1)
     optimiser = torch.optim.Adam(network.parameters(), lr=0.001)
     loader = torch.utils.data.DataLoader(WindowSet(training), batch_size=64, shuffle=True, num_workers=1)
-    percent = float("inf")
+    turns, percent = Turns(64), float("inf")
     for iteration, (features, targets) in enumerate(_for_ever(loader), start=1):
         network.train()
         loss = torch.nn.functional.mse_loss(network(features), targets)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        if iteration % AUTHORS_CHECK == 0:
+        if iteration % race.authors_check == 0:
             percent = min(percent, float(train.estimation_errors(network, validation).mean()))
-        if iteration == 1 or iteration % 20 == 0:
-            tell(iteration, percent, 64)
+        turns.tell(iteration, percent)
 
 
 def _for_ever(loader: torch.utils.data.DataLoader) -> Iterator[Any]:
@@ -133,43 +148,40 @@ RUNS: dict[str, Callable[[Race, DataSet], None]] = {"ours": ours, "authors": aut
 
 
 class Runner:
-    """One way in a process group of its own, which stands still except in its turns."""
+    """One way in a process of its own, which works in its turns only."""
 
     def __init__(self, way: str, race: Race):
         self.target_percent = race.target_percent
         self.told: list[dict[str, Any]] = []
-        self.lines = b""
         self.process = subprocess.Popen(
             [sys.executable, __file__, "--run", way, json.dumps(dataclasses.asdict(race))],
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            start_new_session=True,
+            text=True,
         )
-        assert self.process.stdout is not None
-        self._read(self.process.stdout.readline())  # the first step is done: imports and data are behind it
+        self._listen()  # until the first step is done: imports and data are behind it
         if not self.told:
             raise click.ClickException(f"{way}: ended before its first step; what it said stands above")
-        self._signal(signal.SIGSTOP)
-        os.set_blocking(self.process.stdout.fileno(), False)
 
     def turn(self, seconds: float) -> None:
-        """Lets it run so long, then reads what it told."""
-        self._signal(signal.SIGCONT)
-        time.sleep(seconds)
-        self._signal(signal.SIGSTOP)
+        """Lets it run so long."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{seconds}\n")
+        self.process.stdin.flush()
+        self._listen()
+
+    def _listen(self) -> None:
         assert self.process.stdout is not None
-        self._read(self.process.stdout.read() or b"")
-
-    def _read(self, text: bytes) -> None:
-        *whole, self.lines = (self.lines + text).split(b"\n")
-        self.told += [json.loads(line) for line in whole]
-
-    def end(self) -> None:
-        self._signal(signal.SIGKILL)
+        for line in self.process.stdout:
+            self.told.append(json.loads(line))
+            if self.told[-1]["waits"]:
+                return
         self.process.wait()
 
-    def _signal(self, number: int) -> None:
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, number)
+    def end(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.close()  # what it waits for; were this process killed, it would be closed too
+        self.process.wait()
 
     @property
     def over(self) -> bool:
@@ -219,10 +231,11 @@ def compared(race: Race, one: dict[str, Any], other: dict[str, Any]) -> dict[str
 
 def raced(race: Race, minutes: float, turn_s: float) -> dict[str, Any]:
     """Both in turns until both are there, or for so many minutes by the clock."""
-    runners = {}
-    try:
+    with contextlib.ExitStack() as stack:
+        runners = {}
         for way in WAYS:
             runners[way] = Runner(way, race)
+            stack.callback(runners[way].end)
         end_s = time.monotonic() + 60.0 * minutes
         while time.monotonic() < end_s and not all(runner.over for runner in runners.values()):
             for way, runner in runners.items():
@@ -232,11 +245,8 @@ def raced(race: Race, minutes: float, turn_s: float) -> dict[str, Any]:
                     click.echo(f"{way}: iteration {told['iteration']}, best {told['percent']:.2f} %", err=True)
         silent = [way for way, runner in runners.items() if len(runner.told) < 2]
         if silent:
-            raise click.ClickException(f"{', '.join(silent)}: no step within {minutes:g} minutes; give more --minutes")
+            raise click.ClickException(f"{', '.join(silent)}: no turn within {minutes:g} minutes; give more --minutes")
         return compared(race, *(figures(runners[way].told, race.target_percent) for way in WAYS))
-    finally:
-        for runner in runners.values():
-            runner.end()
 
 
 def table(result: dict[str, Any]) -> str:
