@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -190,6 +190,16 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.targets)
+
+    @staticmethod
+    def joined(parts: Sequence[Windows]) -> Windows:
+        features, targets = ([getattr(part, name) for part in parts] for name in ("features", "targets"))
+        return parts[0] if len(parts) == 1 else Windows(np.concatenate(features), np.concatenate(targets))
+
+    def evenly(self, most: int) -> Windows:
+        """At most `most` of them, spread evenly."""
+        every = -(-len(self) // most)
+        return Windows(self.features[::every], self.targets[::every])
 
 
 def split(data: DataSet, history: int, how: str, seed: int) -> tuple[Windows, Windows, Windows]:

@@ -6,9 +6,10 @@ weights, bit for bit, as one that was not (with the same number of threads on th
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -24,6 +25,7 @@ from modsoft.runtime.files import check_writable
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import networks
 from modsoft.training.dataset import DataSet, Windows, split
+from modsoft.training.muon import Optimiser
 
 # What suits a kind of robot: history and batch of Table S1. A hanging robot's last modules hang from a module that
 # hardly moves beside them, so that they are as good as a robot of their own; with the cable robot nothing was gained by
@@ -34,6 +36,7 @@ BY_KIND: dict[str, dict[str, Any]] = {
 }
 ACTUATION_RANGE = 2.0  # errors are told in percent of it
 CHECKS = 20  # looks at the validation error in a whole run, each with a checkpoint
+VALIDATED = 4096  # windows that a look at the validation error takes at most
 PATIENCE = 8  # checks without a better one that end the run: a one-cycle rate is at its best only in the end
 
 
@@ -86,18 +89,21 @@ def estimation_errors(network: torch.nn.Module, windows: Windows) -> torch.Tenso
 
 
 def train(
-    data: DataSet,
+    data: Sequence[DataSet],
     out: Path,
     settings: Settings,
     progress: Callable[[Progress], None] = lambda told: None,
     clock: Callable[[], float] = time.monotonic,
 ) -> dict[str, Any]:
-    """Trains, writes the checkpoint `out` and gives it. Where `out` is there already of the same data and settings it
+    """Trains on all windows of the data sets, which are of one robot, writes the checkpoint `out` and gives it. Each
+    data set is split on its own. Where `out` is there already of the same data and settings it
     is given as it is, and a run goes on from `out.resume`; either of others is refused. Sets torch's threads and random
     state for the whole process."""
     torch.set_num_threads(settings.threads)
     torch.manual_seed(settings.seed)
-    training, validation, test = split(data, settings.history, settings.split, settings.seed)
+    robot = _robot(data)
+    splits = [split(each, settings.history, settings.split, settings.seed) for each in data]
+    training, validation, test = (Windows.joined(parts) for parts in zip(*splits, strict=True))
     features, actions = training.features.shape[-1], training.targets.shape[-1]
     described: dict[str, Any] = {
         "name": settings.network,
@@ -109,9 +115,9 @@ def train(
         "history": settings.history,
     }
     if settings.network != "bilstm":
-        described["modules"] = data.robot.modules
+        described["modules"] = robot["robot"]["modules"]
     network = networks.build(described)
-    identity = {"data_sha256": data.sha256(), **asdict(settings)}
+    identity = {"data_sha256": data_sha256(data), **asdict(settings)}
     resume = out.with_name(f"{out.name}.resume")
     check_writable(out)
     if out.exists():
@@ -130,17 +136,18 @@ def train(
     errors = estimation_errors(network, test)
     checkpoint = {
         "schema": checkpoints.SCHEMA,
-        "robot": data.recipe["robot"],
+        "robot": robot,
         "network": described,
-        "features": feature_names(data.robot.robot.kind, settings.history),
+        "features": feature_names(data[0].robot.robot.kind, settings.history),
         "weights": state["best"],
         "provenance": {
             **identity,
             "code_version": version("modsoft"),
             "torch_version": str(torch.__version__),
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "strategy": data.recipe["strategy"],
-            "samples": data.samples,
+            "recipes": [{key: value for key, value in each.recipe.items() if key != "robot"} for each in data],
+            "strategy": " + ".join(each.recipe["strategy"] for each in data),
+            "samples": sum(each.samples for each in data),
             "windows": [len(training), len(validation), len(test)],
             "iterations_done": state["iteration"],
             "stopped_early": state["worse"] >= PATIENCE,
@@ -156,6 +163,24 @@ def train(
     return checkpoint
 
 
+def data_sha256(data: Sequence[DataSet]) -> str:
+    """Of all data sets in their order; of one, its own."""
+    digests = [each.sha256() for each in data]
+    return digests[0] if len(digests) == 1 else hashlib.sha256(" ".join(digests).encode()).hexdigest()
+
+
+def _robot(data: Sequence[DataSet]) -> dict[str, Any]:
+    """The robot that all data sets are of; `ModelError` where they are not of one."""
+    robot = data[0].recipe["robot"]
+    for each in data[1:]:
+        if each.recipe["robot"] != robot:
+            raise ModelError(
+                f"data sets of different robots, {robot['name']} and {each.recipe['robot']['name']} (or of one with "
+                "other limits or another rate); a model is trained on data of one robot"
+            )
+    return robot
+
+
 def _fit(
     network: torch.nn.Module,
     training: Windows,
@@ -169,7 +194,8 @@ def _fit(
     """The loop. Leaves the state of its end in the file `resume` and gives it: `best` weights, `best_percent`,
     `iteration`, `elapsed_s` and what it takes to go on."""
     features, targets = torch.from_numpy(training.features), torch.from_numpy(training.targets)
-    optimiser = torch.optim.Adam(network.parameters(), lr=settings.rate)
+    looked_at = validation.evenly(VALIDATED)
+    optimiser = Optimiser(network)
     state: dict[str, Any] = {"identity": identity, "iteration": 0, "elapsed_s": 0.0}
     state |= {"best": None, "best_percent": math.inf, "worse": 0}
     if resume.is_file():
@@ -189,21 +215,18 @@ def _fit(
             order = np.random.default_rng([settings.seed, epoch]).permutation(len(training))
         rows = torch.from_numpy(order[step * settings.batch : (step + 1) * settings.batch])
         modules = _modules_of_step(targets.shape[1], settings, iteration)
-        for group in optimiser.param_groups:
-            group["lr"] = one_cycle(share, settings.rate)
         network.train()
         loss = torch.nn.functional.mse_loss(network(last_modules(features[rows], modules)), targets[rows, -modules:])
-        optimiser.zero_grad()
         loss.backward()
         # The first steps at a high rate now and then meet a gradient a hundred times the usual one.
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
+        optimiser.step(one_cycle(share, settings.rate))
 
         iteration += 1
         before, share = share, _share(iteration, clock() - began_s, settings)
         progress(Progress(iteration, share, loss.item(), state["best_percent"]))
         if _checks_due(share) > _checks_due(before):
-            percent = float(estimation_errors(network, validation).mean())
+            percent = float(estimation_errors(network, looked_at).mean())
             if percent < state["best_percent"]:
                 weights = {name: value.clone() for name, value in network.state_dict().items()}
                 state.update(best=weights, best_percent=percent, worse=0)

@@ -16,7 +16,7 @@ from modsoft.runtime.files import check_writable
 
 
 @click.command("modsoft-train", context_settings={"show_default": True})
-@click.argument("data_file", metavar="DATASET", type=click.Path(path_type=Path))
+@click.argument("data_files", metavar="DATASET...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", default="model.pt", type=click.Path(path_type=Path, dir_okay=False), help="Model to make.")
 @click.option(
     "--network",
@@ -44,12 +44,14 @@ from modsoft.runtime.files import check_writable
 )
 @click.option("--seed", default=0, type=click.IntRange(0), help="The same seed gives the same model.")
 @click.option("--threads", default=1, type=click.IntRange(1), help="Cores; more than are free is far slower than one.")
-def cli(data_file: Path, out: Path, **options: Any) -> None:
-    """Train a network of the paper's Table S1, by default the bidirectional LSTM, on a DATASET of modsoft-collect.
+def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
+    """Train a network of the paper's Table S1, by default the bidirectional LSTM, on one or more data sets of
+    modsoft-collect, all of the same robot.
 
     \b
     Example:
       modsoft-train dataset.h5 --out model.pt
+      modsoft-train staged.h5 smooth.h5 --out model.pt
 
     Stopped or killed, the same command goes on from OUT.resume and ends with the same model. At the end it prints
     how far off the estimated actuation is on data never used, in percent of the actuation range.
@@ -64,9 +66,9 @@ def cli(data_file: Path, out: Path, **options: Any) -> None:
 
     from modsoft.training import dataset, train
 
-    data = dataset.read(data_file)
+    data = [dataset.read(path) for path in data_files]
     told = {name: value for name, value in options.items() if value is not None}
-    suited = train.BY_KIND[data.robot.robot.kind]
+    suited = train.BY_KIND[data[0].robot.robot.kind]
     if options["network"] != "bilstm":
         suited = {**suited, "shorter": 0.0}
     settings = train.Settings(**{**suited, **told})

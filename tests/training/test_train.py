@@ -39,7 +39,7 @@ def test_it_learns_and_the_checkpoint_says_all(tmp_path):
     out = tmp_path / "model.pt"
     data = make(20)
     told = []
-    train.train(data, out, dataclasses.replace(SMALL, iterations=600, rate=0.01, dropout=0.0), told.append)
+    train.train([data], out, dataclasses.replace(SMALL, iterations=600, rate=0.01, dropout=0.0), told.append)
     assert list(tmp_path.iterdir()) == [out]
     found = checkpoints.load(out)
     assert robots.from_dict(found["robot"]) == data.robot
@@ -64,7 +64,7 @@ def test_it_learns_and_the_checkpoint_says_all(tmp_path):
 def test_the_networks_bound_to_a_module_number_learn_too(tmp_path, network):
     data = make(20)
     settings = dataclasses.replace(SMALL, network=network, iterations=600, rate=0.01, dropout=0.0)
-    found = train.train(data, tmp_path / "model.pt", settings)
+    found = train.train([data], tmp_path / "model.pt", settings)
     assert (found["network"]["name"], found["network"]["modules"]) == (network, 3)
     assert found["provenance"]["network"] == network
     # 25 percent is a guess. A module's own angle hides up to 10 of 40 degrees of its neighbour's doing.
@@ -82,7 +82,7 @@ def test_a_network_bound_to_a_module_number_has_no_shorter_robots():
 
 def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
     one, again, other = (
-        train.train(make(), tmp_path / f"{number}.pt", dataclasses.replace(SMALL, seed=seed))["weights"]
+        train.train([make()], tmp_path / f"{number}.pt", dataclasses.replace(SMALL, seed=seed))["weights"]
         for number, seed in enumerate((0, 0, 1))
     )
     assert equal(one, again)
@@ -91,13 +91,13 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
 
 def test_a_finished_model_is_kept_and_of_another_run_refused(tmp_path):
     out = tmp_path / "model.pt"
-    made, told = train.train(make(), out, SMALL), []
+    made, told = train.train([make()], out, SMALL), []
     before = out.read_bytes()
-    again = train.train(make(), out, SMALL, told.append)
+    again = train.train([make()], out, SMALL, told.append)
     assert equal(again["weights"], made["weights"])
     assert not told
     with pytest.raises(ModelError, match=r"there already, made with batch 32, asked for 64; give another --out"):
-        train.train(make(), out, dataclasses.replace(SMALL, batch=64))
+        train.train([make()], out, dataclasses.replace(SMALL, batch=64))
     assert out.read_bytes() == before
 
 
@@ -105,7 +105,7 @@ def test_a_finished_model_is_kept_and_of_another_run_refused(tmp_path):
 def test_a_run_that_diverged_leaves_nothing_to_go_on_from(tmp_path, monkeypatch, error):
     monkeypatch.setattr(train, "estimation_errors", lambda *_: torch.tensor(error))
     with pytest.raises(ModelError, match="diverged"):
-        train.train(make(), tmp_path / "model.pt", SMALL)
+        train.train([make()], tmp_path / "model.pt", SMALL)
     assert not list(tmp_path.iterdir())
 
 
@@ -124,14 +124,14 @@ def cut_at(iteration: int):
 @pytest.mark.parametrize("iteration", [4, 21, 59])
 def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, iteration):
     settings = dataclasses.replace(SMALL, shorter=0.3)
-    straight = train.train(make(), tmp_path / "straight.pt", settings)
+    straight = train.train([make()], tmp_path / "straight.pt", settings)
     out = tmp_path / "cut.pt"
     with pytest.raises(Cut):
-        train.train(make(), out, settings, cut_at(iteration))
+        train.train([make()], out, settings, cut_at(iteration))
     assert not out.exists()
     torch.manual_seed(123)  # a new process has another random state
     resumed = []
-    found = train.train(make(), out, settings, resumed.append)
+    found = train.train([make()], out, settings, resumed.append)
     # From the last check: the work since then was lost, and no more.
     every = settings.iterations // train.CHECKS
     assert resumed[0].iteration == (iteration - 1) // every * every + 1
@@ -143,15 +143,15 @@ def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, iteration):
 def test_a_cut_run_of_other_settings_or_data_is_refused(tmp_path):
     out = tmp_path / "model.pt"
     with pytest.raises(Cut):
-        train.train(make(), out, SMALL, cut_at(7))
+        train.train([make()], out, SMALL, cut_at(7))
     with pytest.raises(ModelError, match=r"model.pt.resume: of a run with batch 32, asked for 64"):
-        train.train(make(), out, dataclasses.replace(SMALL, batch=64))
+        train.train([make()], out, dataclasses.replace(SMALL, batch=64))
     with pytest.raises(ModelError, match="of a run with data_sha256"):
-        train.train(make(seed=1), out, SMALL)
+        train.train([make(seed=1)], out, SMALL)
     resume = tmp_path / "model.pt.resume"
     resume.write_bytes(resume.read_bytes()[:1000])
     with pytest.raises(ModelError, match=r"model.pt.resume: not a checkpoint"):
-        train.train(make(), out, SMALL)
+        train.train([make()], out, SMALL)
 
 
 def test_it_stops_early_and_keeps_the_best_weights(tmp_path):
@@ -160,7 +160,7 @@ def test_it_stops_early_and_keeps_the_best_weights(tmp_path):
     data.action[:] = np.random.default_rng(5).uniform(-1, 1, data.action.shape)
     told = []
     settings = dataclasses.replace(SMALL, iterations=4000, rate=0.02, hidden=32, dropout=0.0)
-    found = train.train(data, tmp_path / "model.pt", settings, told.append)
+    found = train.train([data], tmp_path / "model.pt", settings, told.append)
     best = found["provenance"]["validation_percent"]
     first_with_best = next(t.iteration for t in told if t.validation_percent == best)
     every = settings.iterations // train.CHECKS
@@ -183,7 +183,7 @@ def test_a_budget_of_minutes_ends_the_run_with_its_learning_rate_at_nothing(tmp_
     now = iter(np.arange(0.0, 1e6, 0.5))  # every look at the clock takes half a second
     told = []
     settings = dataclasses.replace(SMALL, iterations=100000, minutes=0.5)
-    found = train.train(make(), tmp_path / "model.pt", settings, told.append, clock=lambda: float(next(now)))
+    found = train.train([make()], tmp_path / "model.pt", settings, told.append, clock=lambda: float(next(now)))
     assert found["provenance"]["seconds"] == pytest.approx(30, abs=2)
     assert told[-1].share >= 1.0
     assert found["provenance"]["iterations_done"] < 100
@@ -198,3 +198,30 @@ def test_the_learning_rate_is_one_cycle():
     assert rates.max() == pytest.approx(0.003)
     assert np.all(np.diff(rates[:301]) > 0)
     assert np.all(np.diff(rates[300:]) < 0)
+
+
+def test_several_data_sets_of_one_robot_are_learned_together(tmp_path):
+    data = [make(), make(5, seed=1)]
+    found = train.train(data, tmp_path / "model.pt", SMALL)["provenance"]
+    alone = [train.train([each], tmp_path / f"{i}.pt", SMALL)["provenance"] for i, each in enumerate(data)]
+    assert found["samples"] == 450
+    assert found["windows"] == list(np.sum([each["windows"] for each in alone], axis=0))
+    assert len({found["data_sha256"], *(each["data_sha256"] for each in alone)}) == 3
+    assert [recipe["seed"] for recipe in found["recipes"]] == [0, 1]
+    swapped = train.train(data[::-1], tmp_path / "swapped.pt", SMALL)["provenance"]
+    assert swapped["data_sha256"] != found["data_sha256"]
+
+
+def test_data_sets_of_different_robots_are_refused(tmp_path):
+    other = make()
+    other.recipe["robot"]["limits"]["largest_actuation_step"] = 0.9
+    with pytest.raises(ModelError, match="different robots, pneumatic-3 and pneumatic-3 .or of one with other limits"):
+        train.train([make(), other], tmp_path / "model.pt", SMALL)
+
+
+def test_a_look_at_the_validation_error_takes_so_many_windows_at_most():
+    windows = dataset.Windows(np.arange(100, dtype=np.float32)[:, None, None], np.zeros((100, 1, 1), np.float32))
+    assert len(windows.evenly(100)) == 100
+    found = windows.evenly(30).features[:, 0, 0]
+    assert len(found) == 25
+    assert set(np.diff(found)) == {4.0}
