@@ -21,13 +21,14 @@ BASELINE_S = 60.0  # over which the device's count is compared with the host's c
 NOISE_DEG = 5.0  # marker noise on top of the fastest motion
 STRETCH = 1.3  # a module's end is never further from the end before it than at rest, but for this
 STRETCH_MM = 10.0
+BEHIND = 0.25  # of its distance at rest: no bent module's end gets so far behind the end before it
 SIZE_TOLERANCE = 0.02  # of the length of a rotation's third axis
 REST_LIMIT_DEG = 60.0
 
 # Why a frame is not used. With the first group the tracker is as good as gone.
 NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED = "no frame", "stale", "frozen", "backwards", "delayed"
 WRONG_NUMBER, HIDDEN, NOT_FINITE, DISTORTED = "wrong number of tools", "tool hidden", "not finite", "distorted"
-SWAPPED, JUMP = "tools too far apart", "jump"
+SWAPPED, REVERSED, JUMP = "tools too far apart", "tools in a wrong order", "jump"
 GOOD = "good"
 GONE = (NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED)
 
@@ -124,6 +125,11 @@ class FrameJudge:
             if np.any(moved > allowed):
                 worst = int(np.argmax(moved))
                 return JUMP, f"module {worst + 1} by {moved[worst]:.0f} degrees, at most {allowed:.0f}", None
+        if self._rest_mm is not None:
+            behind = -_ahead_mm(frame.poses) > BEHIND * self._rest_mm[1:]
+            if np.any(behind):  # all distances are those of a robot whose tools are told from tip to base
+                first = int(np.argmax(behind)) + 1
+                return REVERSED, f"{_tool_name(first + 1)} behind {_tool_name(first)}", None
         return GOOD, "", configuration
 
 
@@ -185,8 +191,7 @@ def check_rest(configuration: Array, poses: Array) -> None:
             f"module {worst + 1} stands at {bent[worst]:.0f} degrees although the robot is vented, expected at most "
             f"{REST_LIMIT_DEG:g}; are the tools in the order base, module 1, ... with z along the robot?"
         )
-    ends, along = poses[1:, :3, 3], poses[1:-1, :3, 2]
-    ahead_mm = np.sum(np.diff(ends, axis=0) * along, axis=-1)
+    ahead_mm = _ahead_mm(poses)
     if np.any(ahead_mm <= 0.0):
         first = int(np.argmax(ahead_mm <= 0.0))
         raise Tripped(
@@ -197,6 +202,11 @@ def check_rest(configuration: Array, poses: Array) -> None:
 
 def _tool_name(tool: int) -> str:
     return "base" if tool == 0 else f"module {tool}"
+
+
+def _ahead_mm(poses: Array) -> Array:
+    """How far (N - 1,) each module's end but the first lies ahead of the end before it, along the latter's z, mm."""
+    return np.sum(np.diff(poses[1:, :3, 3], axis=0) * poses[1:-1, :3, 2], axis=-1)
 
 
 def _lengths_mm(frame: Frame) -> Array:

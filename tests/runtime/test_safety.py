@@ -56,6 +56,7 @@ BAD = {
     safety.NOT_FINITE: lambda: frame(6024, 100.39, poses=one_nan(planar_poses((0.0, 0.0, 0.0)))),
     safety.DISTORTED: lambda: frame(6024, 100.39, poses=stretched(planar_poses((0.0, 0.0, 0.0)))),
     safety.SWAPPED: lambda: frame(6024, 100.39, poses=planar_poses((0.0, 10.0, 20.0))[[0, 2, 1, 3]]),
+    safety.REVERSED: lambda: frame(6024, 100.39, poses=planar_poses((0.0, 10.0, 20.0))[::-1]),
     safety.JUMP: lambda: frame(6024, 100.39, (0.0, 0.0, 120.0)),
 }
 
