@@ -1,9 +1,10 @@
 /* The emulated MEGA: the compiled firmware on simavr's ATmega2560, behind the board's real bootloader.
  *
- * board --elf FIRMWARE [--bootloader HEX] --port-link PATH [--fast]
+ * board --elf FIRMWARE [--bootloader HEX] --port-link PATH [--fast | --stepped]
  *
  * PATH becomes a symbolic link to the board's serial port. Opening it resets the board, as DTR does on the real one.
- * Emulated time is held to real time (never ahead, at most 20 ms behind, else it gives way and says so) unless --fast.
+ * Emulated time is held to real time (never ahead, at most 20 ms behind, else it gives way and says so) unless --fast or
+ * --stepped, where it stands still but for the command `run`: a host on that clock is undisturbed by a busy machine.
  *
  * Commands, one a line on standard input; end of file ends the board:
  *   adc INPUT MILLIVOLT                       voltage on A0..A7
@@ -14,6 +15,7 @@
  *   corrupt-rx|drop-rx|insert-rx P [SEED]     line noise towards the board, probability a byte
  *   corrupt-tx|drop-tx P [SEED]               line noise towards the host
  *   flood MS | seed N                         random bytes at line rate towards the board; seed of the noise
+ *   run US BYTES                              --stepped: go on for so long, once BYTES in all came from the host; then `ran`
  *   stats | quit
  *
  * Events, one JSON object a line on standard output, each with t_us (emulated, from the cycle counter), mono_ns
@@ -24,7 +26,8 @@
  *   uart-open, uart-close, dtr-pulse, wrong-baud
  *   watchdog, reset (cause: power-on, external, watchdog), hang, halted
  *   late       emulated time gave way by late_us
- *   command    line, done: the echo of every command but `adc`
+ *   command    line, done: the echo of every command but `adc` and `run`
+ *   ran        end of a `run`; from_host, to_host: bytes taken from and given to the host in all
  *   stats, summary   times, lateness, share of a core, byte counters; rx_bootloader: bytes that the host wrote while the
  *              board was in reset or in its bootloader; firmware_slept_us and firmware_max_awake_us: how much the firmware
  *              slept since the last reset, and its longest time without (its worst loop)

@@ -64,6 +64,7 @@ _LINK = {
     "native": ("-lm",),
 }  # fmt: skip
 START_TIMEOUT_S = 10.0
+RUN_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 3.0
 
 
@@ -157,6 +158,7 @@ class EmulatedBoard:
         bootloader: bool = True,
         port_link: Path | None = None,
         fast: bool = False,
+        stepped: bool = False,
         on_event: Callable[[Event], None] | None = None,
     ) -> None:
         """Prepare a board; nothing is built or started before `start`.
@@ -166,13 +168,14 @@ class EmulatedBoard:
         port_link: where the link to the serial port goes; a temporary folder where it is None.
         fast: run as fast as it can. The board's time-outs then fire early for a host in real time: only emulated
         times (`t_us`) are worth anything.
+        stepped: its time stands still but for `run`; see `modsoft.hil.stepped`.
         """
         self.board = choose(board)
         self._firmware = firmware
         self._bootloader = bootloader
         self._folder = None if port_link else tempfile.TemporaryDirectory(prefix="modsoft-board-")
         self._link = Path(self._folder.name) / "ttyMEGA" if self._folder else port_link
-        self._fast = fast
+        self._pace = ["--fast"] * fast + ["--stepped"] * stepped
         self._on_event = on_event
         self._process: subprocess.Popen[bytes] | None = None
         self._complaint = ""
@@ -181,6 +184,7 @@ class EmulatedBoard:
         self._duties: list[float] = []
         self.trace: list[Event] = []
         self.ready: Event = {}
+        self.ran: Event = {"t_us": 0.0, "from_host": 0, "to_host": 0}  # the last `run`; stepped only
         self.summary: Event = {}
 
     @property
@@ -205,7 +209,7 @@ class EmulatedBoard:
         if self.board == "simavr":
             command += ["--elf", str(self._firmware or FIRMWARE_ELF)]
             command += ["--bootloader", str(BOOTLOADER)] if self._bootloader else []
-        command += ["--fast"] if self._fast else []
+        command += self._pace
         self._stderr = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, start_new_session=True
@@ -230,6 +234,13 @@ class EmulatedBoard:
                 process.stdin.flush()
         except BrokenPipeError:
             raise DeviceAbsent(f"the {self.board} board has ended") from None
+
+    def run(self, microseconds: int, from_host: int) -> Event:
+        """Stepped: let so much time pass, as soon as so many bytes in all came from the host."""
+        since = len(self.trace)
+        self.send(f"run {microseconds} {from_host}")
+        self.ran = self.wait_for(is_event("ran"), RUN_TIMEOUT_S, since)
+        return self.ran
 
     def duties(self) -> list[float]:
         """The effective duty of each channel now, 0 to 1, in the order of firmware/pins.h."""

@@ -27,6 +27,8 @@
 #define LATE_US 1000            /* a slice later than this is counted */
 #define LATE_BOUND_US 20000     /* later than this, emulated time gives way instead of running after real time */
 #define EVENT_BACKLOG (64u << 20)
+#define STEP_WAIT_US 50 /* for the bytes that a pseudo terminal still holds */
+#define STEP_TRIES 20000
 
 static int events_fd;
 static char *pending;
@@ -36,6 +38,9 @@ static uint64_t started_ns, slices, late_slices, max_late_ns, slipped_ns, pwm_ev
 static double duty_now[MAX_CHANNELS];
 static struct { bool follows; double level_mv; unsigned sent_mv; } sensor[ADC_CHANNELS];
 static double sensor_tau_us;
+static ticks_t run_until;         /* stepped: emulated time stands still from here on */
+static uint64_t run_from_host;    /* ... and does not start before so many bytes came from the host */
+static bool run_told = true;
 static volatile sig_atomic_t stop_signal;
 static pid_t parent;
 static uint64_t random_state = 0x9E3779B97F4A7C15u;
@@ -197,6 +202,11 @@ static bool run_command(char *line)
         random_state = 0x9E3779B97F4A7C15u ^ (uint64_t)a << 20;
     } else if (!strcmp(verb, "stats")) {
         report_statistics("stats");
+    } else if (!strcmp(verb, "run") && numbers == 2 && a > 0) {
+        run_until = board_now() + (ticks_t)(a * TICKS_PER_US);
+        run_from_host = (uint64_t)b;
+        run_told = false;
+        return true; /* a host sends hundreds a second: told when it is done */
     } else {
         known = numbers >= 1 && a >= 0 && a <= 1 && line_command(verb, a);
         if (known && numbers >= 2)
@@ -209,11 +219,11 @@ static bool run_command(char *line)
     return known;
 }
 
-static void read_commands(void)
+static void read_commands(int wait_ms)
 {
     static char buffer[8192];
     static size_t size;
-    if (poll(&(struct pollfd){.fd = 0, .events = POLLIN}, 1, 0) <= 0)
+    if (poll(&(struct pollfd){.fd = 0, .events = POLLIN}, 1, wait_ms) <= 0)
         return;
     ssize_t got = read(0, buffer + size, sizeof buffer - 1 - size);
     if (got <= 0) {
@@ -258,13 +268,32 @@ static void pace(uint64_t *base_ns, ticks_t slice_end)
     }
 }
 
+/* Stepped: waits until there is time to run for; what the host wrote before it gave that time has come in by then. */
+static void await_step(void)
+{
+    while (board_now() >= run_until && !stop_signal) {
+        if (!run_told)
+            event("ran", "\"from_host\":%llu,\"to_host\":%llu", (unsigned long long)line_counters.from_host,
+                  (unsigned long long)line_counters.to_host);
+        run_told = true;
+        flush_events(true);
+        read_commands(1000);
+    }
+    line_poll();
+    for (int tries = 0; line_counters.from_host < run_from_host && line_is_open() && tries < STEP_TRIES; tries++) {
+        usleep(STEP_WAIT_US);
+        line_poll();
+    }
+}
+
 int main(int argc, char **argv)
 {
     struct options options = {0};
     static const struct option names[] = {
         {"elf", required_argument, NULL, 'e'},  {"firmware", required_argument, NULL, 'e'},
         {"bootloader", required_argument, NULL, 'b'}, {"port-link", required_argument, NULL, 'p'},
-        {"fast", no_argument, NULL, 'f'},       {NULL, 0, NULL, 0},
+        {"fast", no_argument, NULL, 'f'},       {"stepped", no_argument, NULL, 's'},
+        {NULL, 0, NULL, 0},
     };
     for (int name; (name = getopt_long(argc, argv, "", names, NULL)) != -1;)
         switch (name) {
@@ -272,6 +301,7 @@ int main(int argc, char **argv)
         case 'b': options.bootloader = optarg; break;
         case 'p': options.port_link = optarg; break;
         case 'f': options.fast = true; break;
+        case 's': options.stepped = true; break;
         default: return EXIT_USAGE;
         }
     if (!options.port_link)
@@ -293,16 +323,23 @@ int main(int argc, char **argv)
     event("ready",
           "\"board\":\"%s\",\"clock\":\"%s\",\"port\":\"%s\",\"channels\":%u,\"bootloader\":%s,\"pid\":%d,"
           "\"p_full_bar\":%g,\"sensors\":%u,\"sensor_mv_per_bar\":%g",
-          board_name, options.fast ? "emulated, not held to real time" : "emulated, held to real time", line_port(),
+          board_name,
+          options.stepped ? "emulated, step by step" : options.fast ? "emulated, not held to real time" : "emulated, held to real time",
+          line_port(),
           board_channels, options.bootloader ? "true" : "false", (int)getpid(), (double)P_FULL / UNITS_PER_BAR,
           (unsigned)SENSORS, SENSOR_MV_PER_UNIT * UNITS_PER_BAR);
 
     uint64_t base_ns = started_ns - board_now() * 1000 / TICKS_PER_US;
     while (!stop_signal) {
+        if (options.stepped)
+            await_step();
         ticks_t slice_end = board_now() + SLICE_US * TICKS_PER_US;
-        if (!options.fast)
+        if (options.stepped && run_until < slice_end)
+            slice_end = run_until;
+        if (!options.fast && !options.stepped)
             pace(&base_ns, slice_end);
-        read_commands();
+        if (!options.stepped)
+            read_commands(0);
         line_poll();
         ticks_t before = board_now();
         board_run(slice_end);

@@ -26,6 +26,7 @@ struct options {
     const char *bootloader; /* Intel hex, or NULL: the reset vector is then the firmware's */
     const char *port_link;  /* symbolic link to be made to the serial port */
     bool fast;              /* do not hold emulated time to real time */
+    bool stepped;           /* emulated time stands still but for the command `run` */
 };
 
 /* --- a board ----------------------------------------------------------------------------------------------------- */
@@ -57,6 +58,7 @@ struct line_counters {
     uint64_t tx_corrupted, tx_dropped;
     uint64_t rx_overrun;               /* lost in the UART: the firmware was too slow */
     uint64_t tx_unread;                /* lost because the host did not read */
+    uint64_t from_host, to_host;       /* taken from and given to the pseudo terminal */
     uint64_t wrong_baud;               /* garbled: host and board set different rates */
 };
 extern struct line_counters line_counters;
@@ -65,6 +67,7 @@ void line_open(const char *link);
 void line_unplug(void);
 void line_plug(const char *link);
 const char *line_port(void);
+bool line_is_open(void);                          /* a host has it open */
 void line_poll(void);                             /* once a slice: opened or closed, bytes in */
 void line_flush(ticks_t now);                     /* once a slice: bytes out whose stop bit has passed */
 int line_next_byte(uint32_t board_baud);          /* the byte that starts to arrive now, or -1; 0: nobody listens */

@@ -100,6 +100,11 @@ const char *line_port(void)
     return slave_name;
 }
 
+bool line_is_open(void)
+{
+    return host_open;
+}
+
 /* The host's termios, seen from the master. Rate 0 is how a host drops DTR with termios alone. */
 static void poll_baud(void)
 {
@@ -143,6 +148,7 @@ void line_poll(void)
         ssize_t got = read(master, bytes, RX_ROOM - rx_count);
         if (got <= 0)
             break;
+        line_counters.from_host += (uint64_t)got;
         if (!board_runs_firmware())
             line_counters.rx_bootloader += (uint64_t)got;
         for (ssize_t i = 0; i < got; i++)
@@ -236,6 +242,7 @@ void line_flush(ticks_t now)
     if (!count || master < 0 || !host_open)
         return;
     ssize_t written = write(master, bytes, count);
+    line_counters.to_host += written > 0 ? (size_t)written : 0;
     line_counters.tx_unread += count - (written > 0 ? (size_t)written : 0);
 }
 

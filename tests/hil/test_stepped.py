@@ -1,0 +1,53 @@
+"""The emulated board on a clock that its host winds: nothing depends on how fast this machine is."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from modsoft.hil.emulator import EmulatedBoard, is_event
+from modsoft.hil.stepped import SteppedPort
+from modsoft.runtime.board import Board
+
+
+def hello_at_s(port: SteppedPort) -> float:
+    board = Board(port, "the board", port.clock, threaded=False)
+    try:
+        return port.clock()
+    finally:
+        board.close()
+
+
+def test_time_stands_still_between_two_steps(board_name: str) -> None:
+    with EmulatedBoard(board_name, stepped=True) as board:
+        board.run(1500, 0)
+        before_us = board.ran["t_us"]
+        time.sleep(0.05)
+        board.send("stats")
+        assert board.wait_for(is_event("stats"), 5)["t_us"] == before_us == pytest.approx(1500, abs=1)
+        assert board.clock == "emulated, step by step"
+
+
+def test_every_opening_takes_the_same_time_to_the_tick(board_name: str) -> None:
+    took_s = []
+    with EmulatedBoard(board_name, stepped=True) as board:
+        for _ in range(3):
+            opened_s = board.ran["t_us"] * 1e-6
+            took_s.append(hello_at_s(SteppedPort(board)) - opened_s)
+            board.run(1000, 0)
+    assert len([event for event in board.trace if event["event"] == "uart-open"]) == 3
+    assert max(took_s) - min(took_s) < 0.0011  # one step
+
+
+def test_what_was_written_is_there_in_the_next_step(board_name: str) -> None:
+    with EmulatedBoard(board_name, stepped=True) as board:
+        port = SteppedPort(board)
+        port.idle(1.0)
+        for number in range(1, 6):
+            port.write(bytes(40))
+            port.idle(0.01)  # 40 bytes take 1.6 ms
+            assert board.ran["from_host"] == 40 * number
+        assert port.in_waiting > 0
+        port.close()
+    assert board.summary["rx"] == 200

@@ -1,0 +1,72 @@
+"""A serial port on a stepped emulated board: the host lives on its clock, and a busy machine disturbs neither."""
+
+from __future__ import annotations
+
+import time
+
+import serial
+
+from modsoft.hil.emulator import EmulatedBoard
+
+STEP_US = 1000
+STEPS_PER_READ = 5  # a read of the runtime's port waits 5 ms
+HELD_AT_MOST = 2048  # by a pseudo-terminal that nobody reads; it has room for more
+ARRIVES_IN_S = 1.0  # in real time
+
+
+class SteppedPort:
+    """What `modsoft.runtime.board.Board` uses of a port, for `threaded=False` and `clock=port.clock`.
+
+    A read without data lets 5 ms pass at most. What was written arrives in the next step, and what the board sent in a
+    step can be read after it.
+    """
+
+    def __init__(self, board: EmulatedBoard, name: str = "", baud: int = 250_000) -> None:
+        """`board`: started with `stepped`. `name`: of its port, where that was plugged in again under another one."""
+        self.dtr = True
+        self.written: list[tuple[float, bytes]] = []  # (clock, bytes)
+        self._board = board
+        self._port = serial.Serial(name or board.port, baud, timeout=0, exclusive=True)
+        self._from_host, self._taken = board.ran["from_host"], board.ran["to_host"]
+
+    def clock(self) -> float:
+        """Emulated seconds."""
+        return float(self._board.ran["t_us"]) * 1e-6
+
+    def idle(self, seconds: float) -> None:
+        """Let time pass, without a look at what comes in it."""
+        self._step(round(seconds * 1e6))
+
+    @property
+    def in_waiting(self) -> int:
+        return self._port.in_waiting
+
+    def read(self, size: int = 1) -> bytes:
+        for _ in range(STEPS_PER_READ):
+            if self.in_waiting:
+                break
+            self._step(STEP_US)
+        data = self._port.read(size)
+        self._taken += len(data)
+        return data
+
+    def write(self, data: bytes) -> int | None:
+        self.written.append((self.clock(), data))
+        self._from_host += len(data)
+        return self._port.write(data)
+
+    def cancel_read(self) -> None:
+        """Nobody else could be in one."""
+
+    def open(self) -> None:
+        self._port.open()
+
+    def close(self) -> None:
+        self._port.close()
+
+    def _step(self, microseconds: int) -> None:
+        to_host = self._board.run(microseconds, self._from_host)["to_host"]
+        on_its_way = min(to_host - self._taken, HELD_AT_MOST)
+        until_s = time.monotonic() + ARRIVES_IN_S
+        while self.in_waiting < on_its_way and time.monotonic() < until_s:
+            time.sleep(0)
