@@ -94,7 +94,7 @@ def describe(text: str, where: str) -> Description:
         if schema != SCHEMA:
             raise ModelError(f"{where}: description schema {schema!r}, this version reads {SCHEMA}; export it again")
         return msgspec.json.decode(text, type=Description)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError) as error:
         raise ModelError(f"{where}: its description cannot be read ({error}); export it again") from error
 
 

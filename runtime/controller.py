@@ -154,8 +154,11 @@ class Controller:
         """Opens a model file; `ModelError` for one that is damaged, of another schema, at odds with its own
         description, or that answers the golden pairs otherwise than torch did."""
         path = Path(path)
-        unit = unit_of(artefact.read(path), str(path))
-        text = unit.session.get_modelmeta().custom_metadata_map.get(artefact.METADATA_KEY)
+        try:
+            unit = unit_of(artefact.read(path), str(path))
+            text = unit.session.get_modelmeta().custom_metadata_map.get(artefact.METADATA_KEY)
+        except UnicodeDecodeError as error:  # onnxruntime passes on whatever bytes stand for a text
+            raise ModelError(f"{path}: a text in it is no UTF-8 ({error.reason}); export it again") from error
         if text is None:
             raise ModelError(f"{path}: no metadata {artefact.METADATA_KEY!r} in it, expected a file of modsoft-export")
         controller = cls(unit, artefact.describe(text, str(path)))

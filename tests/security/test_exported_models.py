@@ -97,6 +97,30 @@ def test_what_a_model_says_does_not_command_the_terminal(tmp_path, model_file, e
     assert (code, len(lines), "\x1b" in lines[0]) == (65, 1, False)
 
 
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (b'"provenance":{', b'"provenance":{"x":' + b"[" * 100_000 + b"]" * 100_000 + b","),
+        (b'"provenance":{"', b'"provenance":{"\xff'),
+        (artefact.ACTUATION.encode(), b"actuatio\xff"),
+    ],
+    ids=["deep", "not a text", "no name"],
+)
+def test_a_description_that_breaks_its_reader(tmp_path, model_file, refused, before, after):
+    content = model_file.read_bytes()
+    if len(before) == len(after):
+        content = content.replace(before, after)
+    else:  # an entry of the metadata, in which lengths have to hold
+        model = onnx.load(model_file)
+        mark = "@" * (len(after) - len(before))
+        (entry,) = model.metadata_props
+        entry.value = entry.value.replace(before.decode(), before.decode() + mark)
+        content = model.SerializeToString().replace(before + mark.encode(), after)
+    seal = artefact._SEAL.search(content)[1]
+    (tmp_path / "model.onnx").write_bytes(artefact.sealed(content.replace(seal, artefact.UNSEALED.encode())))
+    refused(Controller.load, tmp_path / "model.onnx", "UTF-8|description cannot be read|refuses it")
+
+
 def test_a_model_with_weights_at_an_address_of_the_memory(tmp_path, monkeypatch, model_file, refused):
     monkeypatch.chdir(tmp_path)
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
