@@ -9,6 +9,7 @@ import torch
 from modsoft.export import cli as export_cli
 from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
+from modsoft.training import networks
 
 
 def test_a_careless_reader_would_run_the_attack(tmp_path, mark, evil):
@@ -79,10 +80,18 @@ def test_a_compressed_archive_does_not_fill_the_memory(tmp_path, make_checkpoint
     refused(checkpoints.load, path, "an archive with the entry 'model/data/99'")
 
 
-def test_sizes_that_a_file_only_claims_take_no_memory(tmp_path, make_checkpoint, refused):
+def test_sizes_that_a_file_only_claims_take_no_memory(tmp_path, make_checkpoint, refused, monkeypatch):
     path = make_checkpoint(tmp_path / "model.pt")
     sound = checkpoints.load(path)
     torch.save({**sound, "weights": {"head.weight": torch.zeros(1).expand(10**6, 10**6)}}, path)
     refused(checkpoints.load, path, "a tensor larger than what the file holds")
+    build, devices = networks.build, []
+
+    def watched(description):
+        devices.append(torch.empty(0).device.type)
+        return build(description)
+
+    monkeypatch.setattr(networks, "build", watched)
     with pytest.raises(ModelError, match=r"^[^\n]*do not fit[^\n]*$"):
         checkpoints.network_of({**sound, "network": {**sound["network"], "hidden": 10**6}})
+    assert devices == ["meta"]
