@@ -69,7 +69,7 @@ def cli(
 
     Stopped or killed, the same command goes on where it was: whole episodes wait in OUT.parts, and the finished file
     is the same, bit for bit, as if nothing had happened. Neither --jobs nor --backend changes a number. On a cluster
-    every worker needs the same installation and the folder of OUT.
+    every worker needs the same installation and the folder of OUT. While one command works on OUT, another ends with 75.
     """
     if context.invoked_subcommand is not None:
         return

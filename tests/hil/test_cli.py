@@ -1,7 +1,5 @@
 """modsoft-hil and the folder that it writes."""
 
-import subprocess
-
 import click
 import pytest
 
@@ -80,6 +78,8 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path, order):
         order()
 
 
-def test_the_help_says_what_becomes_of_the_folder():
-    told = subprocess.run(["modsoft-hil", "--help"], capture_output=True, text=True, check=True).stdout
-    assert "holds a report already is refused" in " ".join(told.split())
+def test_the_help_says_what_becomes_of_the_folder(capsys):
+    cli.cli.main(["--help"], standalone_mode=False)
+    told = " ".join(capsys.readouterr().out.split())
+    assert "one that holds a report already is refused" in told
+    assert "interrupted leaves its traces there and no report; the next one into the folder replaces them" in told
