@@ -34,7 +34,7 @@ def test_hello_comes_unasked_once_and_first(board):
     assert rest == []
     assert first.protocol_hash == protocol.PROTOCOL_HASH
     assert (first.boot_id, first.reset_cause) == (0xB0A4D, protocol.ResetCause.POWER_ON)
-    assert (first.channels, first.sensors) == (11, 0x3F)
+    assert (first.firmware_version, first.channels, first.sensors) == (1, 11, 0x3F)
     assert (first.p_min, first.p_max, first.p_full, first.slew) == (800, 3500, 30000, 20000)
     assert (first.link_timeout_ms, first.control_timeout_ms) == (300, 1000)
     assert board.state == State.BOOT
@@ -67,8 +67,32 @@ def test_status_tells_it_all(running):
     assert status.tick == running.tick
     assert status.acked_seq == running.seq
     assert status.uptime_ms == running.now_ms
+    assert status.boot_id == 0xB0A4D
     assert status.supply_mv == 5000
     assert (status.rx_bad, status.rx_refused) == (0, 0)
+
+
+def test_status_counts_what_arrived(running):
+    def counted():
+        running.messages()
+        running.wait(100)
+        status = [frame.message for frame in running.messages()][-1]
+        return [status.rx_good, status.rx_bad, status.rx_refused]
+
+    before = counted()
+    for _ in range(3):
+        running.tell(protocol.Heartbeat(running.tick))
+    running.tell(ClearFault(0))  # nothing to clear: refused
+    running.feed(b"\x05\x05\0" + b"\0")  # the second delimiter ends nothing
+    assert [after - earlier for after, earlier in zip(counted(), before, strict=True)] == [4, 1, 1]
+
+
+def test_frames_are_numbered(board):
+    frames = []
+    for _ in range(256):
+        board.wait(100)
+        frames += board.messages()
+    assert [frame.seq for frame in frames] == [*range(256), 0]
 
 
 def test_every_pass_reports_every_check(running):
@@ -320,6 +344,7 @@ def test_host_gone_vents_in_time(running):
     assert running.state == State.RUNNING
     running.wait(1)
     assert (running.state, running.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
+    assert running.applied[0] == 3480, "it ramps"
     assert 301 + until_vented(running) <= 670
     assert running.counts == [0] * 12
 
@@ -378,6 +403,19 @@ def test_latched_fault_needs_the_exact_mask_and_the_pressures_down(running):
     running.tell(ClearFault(Fault.LINK_TIMEOUT))
     assert (running.state, running.faults) == (State.IDLE, Fault(0))
     assert reason(running.set(800)) == NackReason.STATE
+
+
+def test_faults_add_up_and_are_cleared_together(running):
+    running.wait(301)
+    running.measured[:6] = [4501] * 6
+    running.wait(100)
+    both = Fault.LINK_TIMEOUT | Fault.OVER_PRESSURE
+    assert running.faults == both
+    running.measured[:6] = [0] * 6
+    running.wait(1)
+    assert reason(running.tell(ClearFault(Fault.OVER_PRESSURE))) == NackReason.RANGE
+    running.tell(ClearFault(both))
+    assert running.state == State.IDLE
 
 
 def test_clear_fault_without_fault_refused(running):
@@ -495,7 +533,16 @@ def test_nothing_that_a_host_says_while_idle_opens_a_valve(board):
         assert board.counts == [0] * 12
 
 
-def test_queue_for_the_host_fills_to_the_brim_and_no_further(board):
+def test_queue_for_the_host_fills_to_the_brim(board):
+    board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH)) * 4)
+    board.feed((b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0") * 5)
+    raw = board.drain()
+    kinds = [type(frame.message) for frame in protocol.Parser().feed(raw)]
+    assert kinds == [Hello] * 5 + [protocol.Nack] * 5
+    assert len(raw) == 255
+
+
+def test_queue_for_the_host_fills_no_further(board):
     """A full ring would look like an empty one: 256 bytes must not be queued."""
     board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH)) * 3)
     board.feed((b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0") * 8)
