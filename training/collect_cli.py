@@ -25,8 +25,9 @@ from modsoft.runtime.files import check_writable
 @click.option(
     "--strategy",
     default="staged",
-    type=click.Choice(["staged", "random"]),
-    help="staged: modules share one action sequence at first, fewer of them in every stage. random: each its own.",
+    type=click.Choice(["staged", "random", "smooth", "varied"]),
+    help="staged: modules share one action sequence at first, fewer of them in every stage. random: each its own. "
+    "smooth: actions that wander, as tasks move. varied: the same on robots of other stiffness and payload.",
 )
 @click.option("--seed", default=0, type=click.IntRange(0), help="The same seed gives the same data set.")
 @click.option("--steps", default=300, type=click.IntRange(1), help="Control steps of an episode; each starts at rest.")
@@ -69,7 +70,7 @@ def cli(
 
     Stopped or killed, the same command goes on where it was: whole episodes wait in OUT.parts, and the finished file
     is the same, bit for bit, as if nothing had happened. Neither --jobs nor --backend changes a number. On a cluster
-    every worker needs the same installation and the folder of OUT. While one command works on OUT, another ends with 75.
+    every worker needs the same installation and the folder of OUT. While one works on OUT, another ends with 75.
     """
     if context.invoked_subcommand is not None:
         return

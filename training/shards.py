@@ -74,7 +74,7 @@ class Shards:
     def open(self, recipe: dict[str, Any]) -> None:
         """Begins in the folder, or checks that what is there belongs to the same recipe (`ModelError`)."""
         for stale in self.folder.glob(".*.tmp"):  # of a process that was killed while it wrote
-            stale.unlink(missing_ok=True)
+            self._drop(stale)
         told = self.folder / "recipe.json"
         if told.is_file():
             try:
@@ -105,7 +105,7 @@ class Shards:
 
     def _drop(self, path: Path) -> None:
         try:
-            path.unlink()
+            path.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(f"{path}: no whole episode, and cannot be deleted ({error.strerror})") from error
 
@@ -120,8 +120,9 @@ class Shards:
             with np.load(path, allow_pickle=False) as file:
                 return Episode(file["configuration"], file["action"], int(file["redrawn"]))
         except (OSError, KeyError, TypeError, BadZipFile, *NOT_AN_ARRAY) as error:
+            why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged, or another format"
             raise ModelError(
-                f"{path}: no whole episode ({error}); every worker must share this folder, run again to make it"
+                f"{path}: no whole episode ({why}); every worker must share this folder, run again to make it"
             ) from error
 
     def write(self, index: int, episode: Episode) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import from_angles_deg
-from modsoft.runtime.errors import InUse
+from modsoft.runtime.errors import InUse, OutputError
 from modsoft.training import collect, dataset
 from modsoft.training.plants import Plant
 from modsoft.training.shards import Shards
@@ -68,6 +68,13 @@ def test_an_odd_episode_is_made_again(tmp_path, parts, attack):
     attack(parts / "episode-000001.npz")
     assert collected(tmp_path / "d.h5").samples == 20
     assert dataset.read(tmp_path / "d.h5").samples == 20
+
+
+@pytest.mark.parametrize("name", ["episode-000000.npz", ".x.tmp"])
+def test_a_folder_in_the_place_of_a_file_is_told(tmp_path, parts, name):
+    (parts / name).mkdir()
+    with pytest.raises(OutputError, match=f"{name}: no whole episode, and cannot be deleted"):
+        collected(tmp_path / "d.h5")
 
 
 def test_a_pickle_among_the_episodes_is_not_run(tmp_path, parts, mark, evil):
