@@ -97,22 +97,6 @@ def test_a_frozen_tracker_is_found_within_three_ticks_whatever_the_phase():
         assert words[2] != "good"
 
 
-@pytest.mark.parametrize("drift", [-1e-4, 0.0, 1e-4])
-def test_no_false_alarm_in_an_hour_of_noise(drift):
-    """Half a millimetre and half a degree of noise, jitter of the line, a device clock that is 100 ppm off."""
-    rng = np.random.default_rng(1)
-    judge = FrameJudge(ROBOT)
-    for step in range(9000):
-        now_s = 1000.0 + step * PERIOD_S
-        age_s = rng.uniform(0.002, 0.045)
-        angles = np.array([5.0, 30.0, 80.0]) * np.sin(2 * np.pi * step / 200) + rng.normal(0, 0.5, 3)
-        poses = planar_poses(angles)
-        poses[:, :3, 3] += rng.normal(0, 0.5, (4, 3))
-        number = int((now_s - age_s - rng.uniform(0, 0.017)) * 60 * (1 + drift))
-        judged = judge.judge(frame(number, now_s - age_s, poses=poses), now_s)
-        assert judged.good, (step, judged)
-
-
 def test_a_delay_is_found_although_the_host_sees_fresh_frames():
     judge = FrameJudge(ROBOT)
     for step in range(10):
