@@ -274,12 +274,12 @@ static uint8_t check_control(struct controller *c, uint32_t now_ms) {
   return CHECK_CONTROL;
 }
 
-/* Counts how long something has been the case; true once it has been for limit_ms, and then counts anew. */
+/* Counts how long something has been the case; true when it has been for limit_ms. Counts anew after a minute, when what
+ * it found has long been latched. */
 static bool lasts(uint16_t *counted_ms, bool is, uint32_t elapsed_ms, uint16_t limit_ms) {
   uint32_t lasted_ms = is ? *counted_ms + elapsed_ms : 0;
-  bool too_long = lasted_ms >= limit_ms;
-  *counted_ms = too_long ? 0 : (uint16_t)lasted_ms;
-  return too_long;
+  *counted_ms = (uint16_t)lasted_ms;
+  return lasted_ms >= limit_ms;
 }
 
 static uint8_t check_sensors(struct controller *c, uint32_t elapsed_ms) {
@@ -291,7 +291,7 @@ static uint8_t check_sensors(struct controller *c, uint32_t elapsed_ms) {
       continue;
     }
     if (lasts(&c->over_ms[channel], measured > P_OVER, elapsed_ms, OVER_PRESSURE_MS)) {
-      latch(c, FAULT_OVER_PRESSURE); /* in any state; and again while it lasts, so that it cannot be cleared */
+      latch(c, FAULT_OVER_PRESSURE); /* in any state */
     }
     off = (int16_t)(measured - c->output.applied[channel]); /* both lie between 0 and SENSOR_FULL */
     driven = c->state == STATE_RUNNING && ((c->channels >> channel) & 1);
@@ -353,7 +353,7 @@ bool controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms) {
 uint8_t controller_update(struct controller *c, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,
                           uint32_t now_ms) {
   uint32_t elapsed_ms = now_ms - c->now_ms;
-  uint8_t checks = 0;
+  uint8_t checks;
 
   c->now_ms = now_ms;
   memcpy(c->measured, measured, sizeof c->measured);
@@ -361,7 +361,7 @@ uint8_t controller_update(struct controller *c, const int16_t measured[PROTOCOL_
   if (c->state == STATE_BOOT) {
     c->state = STATE_IDLE;
   }
-  checks |= check_link(c, now_ms);
+  checks = check_link(c, now_ms);
   checks |= check_control(c, now_ms);
   checks |= check_sensors(c, elapsed_ms);
   checks |= drive_outputs(c, elapsed_ms);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import zlib
 
 import pytest
@@ -45,6 +46,22 @@ def test_hello_comes_unasked_once_and_first(board):
     assert board.state == State.IDLE
     assert all(isinstance(answer, Status) for answer in answers)
     assert len(answers) == 10
+
+
+def test_before_the_first_pass_nothing_is_measured(board):
+    (status,) = board.tell(Vent(VentMode.RAMP))
+    assert (status.state, status.measured) == (State.BOOT, (protocol.NOT_MEASURED,) * 12)
+
+
+def test_status_comes_every_tenth_of_a_second(board):
+    for _ in range(3):
+        board.messages()
+        board.wait(99)
+        assert board.messages() == []
+        board.wait(1)
+        assert len(board.messages()) == 1
+    board.library.controller_next_byte.restype = ctypes.c_int16
+    assert board.library.controller_next_byte(board.handle) == -1
 
 
 def test_hello_on_request_in_any_state(running):
@@ -351,8 +368,11 @@ def test_host_gone_vents_in_time(running):
 
 def test_armed_host_gone_is_a_fault_too(board):
     board.beat(1100)
-    board.arm()
-    board.wait(301)
+    (status,) = board.arm()
+    assert status.state == State.ARMED
+    board.wait(300)
+    assert board.state == State.ARMED
+    board.wait(1)
     assert (board.state, board.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
 
 
@@ -386,6 +406,16 @@ def test_stuck_control_loop_vents(running):
     assert running.now_ms - started + until_vented(running) <= 1400
 
 
+@pytest.mark.parametrize(("waited_ms", "state"), [(1000, State.RUNNING), (1001, State.FAULT)])
+def test_control_loop_may_stand_still_for_a_second(running, waited_ms, state):
+    running.set(800)
+    for _ in range(waited_ms):
+        running.wait(1)
+        running.follow()
+        running.tell(protocol.Heartbeat(running.tick))
+    assert running.state == state
+
+
 def test_latched_fault_needs_the_exact_mask_and_the_pressures_down(running):
     running.wait(301)
     assert running.faults == Fault.LINK_TIMEOUT
@@ -393,10 +423,12 @@ def test_latched_fault_needs_the_exact_mask_and_the_pressures_down(running):
     assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # still ramping
     until_vented(running)
     assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # sensors still up
-    running.measured[:6] = [499] * 5 + [500]
-    running.wait(1)
-    assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE
-    running.measured[5] = 499
+    for channel in range(6):
+        running.measured[:6] = [499] * 6
+        running.measured[channel] = 500
+        running.wait(1)
+        assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE
+    running.measured[:6] = [499] * 6
     running.wait(1)
     for mask in (0, Fault.LINK_TIMEOUT | Fault.LEAK, Fault.CONTROL_TIMEOUT):
         assert reason(running.tell(ClearFault(mask))) == NackReason.RANGE
@@ -490,6 +522,16 @@ def test_late_first_pass_does_not_count_the_time_before_it(new_board):
     assert board.faults == Fault(0)
     board.wait(1)
     assert board.faults == Fault.OVER_PRESSURE
+
+
+def test_channels_without_a_sensor_are_not_judged_at_all(board):
+    board.beat(1100)
+    board.arm(channels=0x7FF)
+    board.set(*(800,) * 11)
+    for _ in range(30):
+        board.beat(100)
+        board.follow()
+    assert board.state == State.RUNNING
 
 
 def test_channels_of_no_session_are_not_judged_for_leaks(board):
