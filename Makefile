@@ -9,7 +9,7 @@ export MPLBACKEND ?= Agg
 PYTEST := .venv/bin/python -m pytest
 INSTALLED := .venv/.installed
 
-.PHONY: demo install test test-cluster reliability soak check coverage firmware clean
+.PHONY: demo install test test-cluster reliability soak check coverage mutation fuzz firmware clean
 
 demo: $(INSTALLED)
 	.venv/bin/python tools/demo.py
@@ -45,6 +45,15 @@ check: $(INSTALLED)
 # Of the firmware by its native tests; fails below 100 % of lines and branches.
 coverage: $(INSTALLED)
 	.venv/bin/python tools/coverage.py
+
+# Small wrong changes of the firmware, each of which a native test has to notice.
+mutation: $(INSTALLED)
+	.venv/bin/python tools/mutate.py
+
+# Coverage-guided fuzzing of the firmware's parser and controller for FUZZ_SECONDS; needs clang, which it installs or asks for.
+FUZZ_SECONDS ?= 60
+fuzz:
+	tools/fuzz/run.sh $(FUZZ_SECONDS)
 
 firmware:
 	$(MAKE) -C firmware
