@@ -165,14 +165,15 @@ def finish(board: Board | None, log: logs.RunLog, tally: Tally, slot: Slot, erro
         reason = str(error) or type(error).__name__
     log.put({"event": "end", "mono_ns": began_ns, "exit_code": code, "reason": reason, "vented": vented,
              "vented_ns": vented_ns, "still_bar": pressed})  # fmt: skip
-    figures = {"figures": tally.figures(), "tracker": dict(slot.counts), "vented": vented}
-    log.close(code, reason, {**figures, "link": None if board is None else board.statistics})
     if board is None:
         word = "dry run, no valve was touched"
     else:
         word = "yes, said by the board" if vented else "NOT KNOWN, the board did not say so; look at the pressures"
-    for line in [*tally.summary(), f"valves vented: {word}", f"log: {log.folder}"]:
+    for line in [*tally.summary(), f"valves vented: {word}"]:  # before the log: a disk may hang
         _say(line)
+    figures = {"figures": tally.figures(), "tracker": dict(slot.counts), "vented": vented}
+    log.close(code, reason, {**figures, "link": None if board is None else board.statistics})
+    _say(f"log: {log.folder}")
     if log.trouble:
         _say(f"log: {log.trouble}")
     if error is not None:

@@ -155,6 +155,17 @@ def test_what_a_hanging_disk_still_owes_at_the_end_is_told(tmp_path, monkeypatch
     freed.set()
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_what_a_bug_in_the_writer_cost_is_told(tmp_path):
+    writer = logs.Writer(tmp_path / "run.jsonl")
+    writer.put({"tick": 0})
+    writer.put({"tick": 1, "of no kind that JSON knows": object()})
+    writer.put({"tick": 2})
+    writer.close()
+    assert writer.lost == 2
+    assert (tmp_path / "run.jsonl").read_text() == '{"tick":0}\n'
+
+
 def test_a_full_disk_leaves_no_half_meta_file(tmp_path, monkeypatch):
     log = a_log(tmp_path)
     write = Path.write_text

@@ -102,6 +102,14 @@ def test_the_stop_key_vents_at_once(tmp_path, capsys):
     assert board.modes == [VentMode.DUMP]
 
 
+def test_the_venting_is_told_although_the_disk_hangs(tmp_path, capsys, monkeypatch):
+    said = []
+    monkeypatch.setattr(RunLog, "close", lambda *told: said.append(capsys.readouterr().err))
+    log = RunLog(tmp_path, "arm", "", {})
+    session.finish(Board(True), log, Tally(ROBOT, 10), Slot(), None)
+    assert "valves vented: yes, said by the board" in said[0]
+
+
 def test_a_dry_run_says_so(tmp_path, capsys):
     ending = Ending(tmp_path, capsys, None)
     assert "no valve was touched" in ending.said
