@@ -35,6 +35,17 @@ def test_modsoft_export_ends_with_65(tmp_path, mark, evil, make_checkpoint, ende
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_the_names_in_a_checkpoint_do_not_command_the_terminal(tmp_path, make_checkpoint, ended):
+    path = make_checkpoint(tmp_path / "model.pt")
+    found = checkpoints.load(path)
+    found["weights"]["\x1b[2J"] = torch.zeros(1)
+    torch.save(found, path)
+    code, said = ended(export_cli.main, path)
+    assert (code, len(said)) == (65, 1)
+    assert "\\x1b[2J" in said[0]
+    assert "\x1b" not in said[0]
+
+
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 def test_a_bare_pickle_and_a_torchscript_are_not_run(tmp_path, mark, evil, refused):
     path = tmp_path / "model.pt"
