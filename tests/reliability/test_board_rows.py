@@ -1,6 +1,7 @@
 """Failure matrix, board and cable: rows 5, 6, 8, 10, 28, 29, 30, on the compiled firmware behind the real bootloader.
 
-What the board does is judged in emulated time, what the host notices in the host's own.
+Board and host live on the board's own clock, its cycle counter, so that a busy machine changes nothing; only in row 10
+is the host a process in real time.
 """
 
 import contextlib
@@ -11,7 +12,7 @@ from itertools import pairwise
 
 import mega_in_run
 import pytest
-from mega_in_run import Host, in_run, inject, side_by_side
+from mega_in_run import Host, in_stepped_run, inject, side_by_side
 
 from modsoft.hil.emulator import EmulatedBoard, is_event, missing_packages
 from modsoft.hil.trace import rises, vented_us
@@ -32,20 +33,24 @@ from modsoft.runtime.protocol import (
 )
 
 missing = missing_packages("simavr")
-pytestmark = [pytest.mark.realtime, pytest.mark.skipif(bool(missing), reason=f"simavr needs {' '.join(missing)}")]
+pytestmark = [
+    pytest.mark.skipif(bool(missing), reason=f"simavr needs {' '.join(missing)}"),
+    pytest.mark.timeout(1800),  # all tries on a busy machine
+]
 
 SETTLED_S = 0.8  # after that a vent is over, whatever began it
+AT_ONCE = 2  # boards; each takes what it can get of a core
 
 
 def vented_ms(emulated, since, from_us):
     return (vented_us(emulated.trace, since) - from_us) / 1000
 
 
-def lost_ns(host):
-    """CLOCK_MONOTONIC (ns) at which the control loop learned that the board is lost."""
+def lost_ms(host, from_us):
+    """After how long the control loop learned that the board is lost."""
     with pytest.raises(LostInRun):
         host.go_on(3.0)
-    return time.monotonic_ns()
+    return host.clock() * 1e3 - from_us / 1000
 
 
 def worst(results):
@@ -55,34 +60,38 @@ def worst(results):
 
 def test_row_05_garbage_at_line_rate(matrix_row, full):
     def attempt(_):
-        with in_run(threaded=False) as (host, emulated):
-            frames = len(Parser().feed(b"".join(data for _, data in host.written)))
-            time.sleep(0.02)  # until the last of them is in
+        with in_stepped_run() as (host, emulated):
+            port, parser, heard = host.port, Parser(), []
+            sent = Parser().feed(b"".join(data for _, data in port.written))
+            port.idle(0.02)  # until the last of them is in
             flood, since = inject(emulated, f"flood {FLOOD_S * 1000}")
-            parser, heard, asked_s = Parser(), [], None
-            while not any(isinstance(message, Hello) for message in heard):
-                heard += [frame.message for frame in parser.feed(host.port.read(256))]
-                if asked_s is None and inject(emulated, "stats", "stats")[0]["t_us"] >= flood["t_us"] + FLOOD_S * 1e6:
-                    asked_s = time.monotonic()
-                    host.port.write(b"\0" + encode(HelloReq(PROTOCOL_HASH)))
-                assert asked_s is None or time.monotonic() < asked_s + 5.0
-            answered_ms = (time.monotonic() - asked_s) * 1e3
-            status = None
-            while not isinstance(status, Status):
-                status = next((frame.message for frame in parser.feed(host.port.read(256))), None)
+
+            def hear(kind, until_s):
+                while not any(isinstance(message, kind) for message in heard) and port.clock() < until_s:
+                    heard.extend(frame.message for frame in parser.feed(port.read(256)))
+
+            over_s = flood["t_us"] * 1e-6 + FLOOD_S
+            hear(Hello, over_s)
+            heard.clear()
+            port.write(b"\0" + encode(HelloReq(PROTOCOL_HASH)))
+            hear(Hello, over_s + 5.0)
+            answered_ms = (port.clock() - over_s) * 1e3
+            heard.clear()
+            hear(Status, over_s + 10.0)
+            [status] = heard
             assert (status.state, status.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
-            assert status.rx_good == frames + 1, "nothing in the garbage was taken for a frame"
+            assert status.rx_good == len(sent) + 1, "nothing in the garbage was taken for a frame"
             assert status.rx_bad > 100
             assert rises(emulated.trace, since) == 0
             assert not [event for event in emulated.trace[since:] if event["event"] in ("reset", "watchdog")]
             return vented_ms(emulated, since, flood["t_us"]), answered_ms
 
     tries = 10 if full else 2
-    vented, answered = worst(side_by_side(tries, attempt, 2))
+    vented, answered = worst(side_by_side(tries, attempt, AT_ONCE))
     matrix_row(5, fault=f"garbage at line rate, {FLOOD_S} s", tries=tries, limit="0 applied, all 0 in 700 ms, no reset",
                worst=f"0 applied, {vented:.0f} ms, no reset", clock="emulated")  # fmt: skip
     matrix_row(5, fault="garbage at line rate: HELLO after it", tries=tries, limit="1 s", worst=f"{answered:.0f} ms",
-               clock="host")  # fmt: skip
+               clock="emulated")  # fmt: skip
     assert vented <= 700
     assert answered <= 1000
 
@@ -92,53 +101,52 @@ FLOOD_S = 10
 
 def test_row_06_cable_pulled(matrix_row, full):
     def attempt(_):
-        with in_run() as (host, emulated):
+        with in_stepped_run() as (host, emulated):
             cut, since = inject(emulated, "unplug")
-            noticed_ms = (lost_ns(host) - cut["mono_ns"]) * 1e-6
+            noticed_ms = lost_ms(host, cut["t_us"])
             assert host.board.vent() is False  # nobody said so
-            time.sleep(SETTLED_S)
+            emulated.run(round(SETTLED_S * 1e6), 0)
             assert rises(emulated.trace, since) == 0
             return vented_ms(emulated, since, cut["t_us"]), noticed_ms
 
     tries = 50 if full else 10
-    vented, noticed = worst(side_by_side(tries, attempt))
+    vented, noticed = worst(side_by_side(tries, attempt, AT_ONCE))
     matrix_row(6, fault="cable pulled: board vents", tries=tries, limit="all 0 in 700 ms", worst=f"{vented:.0f} ms",
                clock="emulated")  # fmt: skip
     matrix_row(6, fault="cable pulled: host notices", tries=tries, limit="150 ms", worst=f"{noticed:.1f} ms",
-               clock="host")  # fmt: skip
+               clock="emulated")  # fmt: skip
     assert vented <= 700
     assert noticed <= 150
 
 
 def test_row_08_board_reset_in_mid_run(matrix_row, full):
     def attempt(number):
-        with in_run() as (host, emulated):
+        with in_stepped_run() as (host, emulated):
             reset, since = inject(emulated, ("reset", "power-cycle")[number % 2])
-            noticed_ms = (lost_ns(host) - reset["mono_ns"]) * 1e-6
-            silent = len(host.written)
-            assert host.board.vent()
-            back_ms = time.monotonic_ns() * 1e-6 - reset["mono_ns"] * 1e-6
+            noticed_ms = lost_ms(host, reset["t_us"])
+            silent = len(host.port.written)
+            assert host.board.vent(), "it is back, vented, and says so"
+            back_ms = host.clock() * 1e3 - reset["t_us"] / 1000
             assert host.board.status.boot_id != host.board.hello.boot_id
             assert (host.board.status.state, host.board.status.faults) == (State.IDLE, 0)
             with pytest.raises(LostInRun):
                 host.board.set_pressures(host.tick + 1, [Host.BAR])
-            assert len(host.written) == silent, "not a byte after it noticed"
+            assert len(host.port.written) == silent, "not a byte after it noticed"
             assert rises(emulated.trace, since) == 0
             return vented_ms(emulated, since, reset["t_us"]), noticed_ms, back_ms
 
-    tries = 50 if full else 10
-    vented, noticed, back = worst(side_by_side(tries, attempt, 10))
-    matrix_row(8, fault="board reset in mid-run: outputs", tries=tries, limit="all 0 in 130 ms",
-               worst=f"{vented:.1f} ms", clock="emulated")  # fmt: skip
-    matrix_row(8, fault="board reset in mid-run: host", tries=tries,
-               limit="noticed in 1.2 s, then silent, back in 6 s",
-               worst=f"noticed in {noticed / 1e3:.2f} s, 0 bytes, back in {back / 1e3:.2f} s",
-               clock="host")  # fmt: skip
+    tries = 50
+    vented, noticed, back = worst(side_by_side(tries, attempt, AT_ONCE))
+    matrix_row(8, fault="board reset in mid-run", tries=tries,
+               limit="noticed in 1.2 s, outputs 0 in 130 ms, back in 6 s, no byte sent to it",
+               worst=f"{noticed / 1e3:.2f} s, {vented:.1f} ms, {back / 1e3:.2f} s, 0 bytes",
+               clock="emulated")  # fmt: skip
     assert vented <= 130
     assert noticed <= 1200
     assert back <= 6000
 
 
+@pytest.mark.realtime
 def test_row_10_host_killed(matrix_row, full):
     rounds, boards = (10 if full else 2), 5
     results = []
@@ -154,7 +162,7 @@ def test_row_10_host_killed(matrix_row, full):
             time.sleep(Host.PERIOD_S * number / rounds)
             just_before = [inject(board, "stats", "stats") for board in emulated]
             process.kill()
-            time.sleep(SETTLED_S)
+            time.sleep(2 * SETTLED_S)
             for board, (event, since) in zip(emulated, just_before, strict=True):
                 assert rises(board.trace, since) == 0
                 results.append(vented_ms(board, since, event["t_us"]))
@@ -166,17 +174,17 @@ def test_row_10_host_killed(matrix_row, full):
 
 def test_row_28_firmware_hangs(matrix_row, full):
     def attempt(number):
-        with in_run() as (host, emulated):
+        with in_stepped_run() as (host, emulated):
             hang, since = inject(emulated, ("hang", "hang cli")[number % 2], "hang")
-            emulated.wait_for(is_event("reset", cause="watchdog"), 2.0, since)
-            assert lost_ns(host)
+            assert lost_ms(host, hang["t_us"]) < 1200
+            assert any(map(is_event("reset", cause="watchdog"), emulated.trace[since:]))
             assert host.board.vent(), "it runs again and says so"
             assert host.board.status.boot_id == host.board.hello.boot_id + 1
             assert rises(emulated.trace, since) == 0
             return vented_ms(emulated, since, hang["t_us"])
 
-    tries = 50 if full else 10
-    vented = max(side_by_side(tries, attempt, 10))
+    tries = 100 if full else 20
+    vented = max(side_by_side(tries, attempt, AT_ONCE))
     matrix_row(28, fault="firmware hangs", tries=tries, limit="all 0 in 130 ms", worst=f"{vented:.1f} ms",
                clock="emulated")  # fmt: skip
     assert vented <= 130
@@ -188,7 +196,7 @@ def test_row_29_sensors(matrix_row, full):
 
     def attempt(number):
         times_ms = []
-        with in_run() as (host, emulated):
+        with in_stepped_run() as (host, emulated):
             for _, shown_bar, fault in faults:
                 shown = f"adc {number % 6} {emulated.millivolt(shown_bar)}\nstats"
                 event, since = inject(emulated, shown, "stats")
@@ -206,7 +214,7 @@ def test_row_29_sensors(matrix_row, full):
         return times_ms
 
     tries = 60 if full else 6
-    found = dict(zip((name for name, *_ in faults), worst(side_by_side(tries, attempt, 6)), strict=True))
+    found = dict(zip((name for name, *_ in faults), worst(side_by_side(tries, attempt, AT_ONCE)), strict=True))
     matrix_row(29, fault="over-pressure: dumped", tries=tries, limit="all 0 in 110 ms",
                worst=f"{found['over-pressure']:.1f} ms", clock="emulated")  # fmt: skip
     for name in ("stuck", "leak"):
@@ -219,13 +227,12 @@ def test_row_29_sensors(matrix_row, full):
 
 def test_row_30_host_does_not_read(matrix_row, full):
     """While the outputs slew they move in every pass of the firmware's loop: the time between is that of the loop."""
-    seconds = 200 if full else 20
+    seconds = 600 if full else 30
 
     def attempt(_):
-        with in_run(threaded=False) as (host, emulated):
-            since, session = len(emulated.trace), host.board._link.session
+        with in_stepped_run() as (host, emulated):
+            port, since, session = host.port, len(emulated.trace), host.board._link.session
             tick, seq = host.tick, host.board.set_pressures(host.tick, [Host.BAR] * 6)
-            began_s, longest_s = time.monotonic(), 0.0
             for step in range(seconds * 10):
                 tick += 1
                 beat = encode(Heartbeat(tick), 0, session)
@@ -233,13 +240,10 @@ def test_row_30_host_does_not_read(matrix_row, full):
                     seq = (seq + 1) % 256
                     units = to_units((0.08, Host.BAR)[step % 2])
                     beat += encode(Set(tick, (units,) * 6 + (0,) * (CHANNELS - 6)), seq, session)
-                host.port.write(beat)
-                time.sleep(0.05)
-                host.port.write(encode(HelloReq(PROTOCOL_HASH)))  # its answers fill the line sooner
-                time.sleep(0.05)
-                began_s, before_s = time.monotonic(), began_s
-                longest_s = max(longest_s, began_s - before_s)
-            assert longest_s < 0.25, f"this machine is too busy to beat in time: {longest_s:.2f} s between two beats"
+                port.write(beat)
+                port.idle(0.05)
+                port.write(encode(HelloReq(PROTOCOL_HASH)))  # its answers fill the line sooner
+                port.idle(0.05)
             stats, _ = inject(emulated, "stats", "stats")
             assert stats["tx_unread"] > 1000, "the line is full"
             moved_us = [event["t_us"] for event in emulated.trace[since:] if is_event("pwm", channel=0)(event)]
@@ -249,7 +253,7 @@ def test_row_30_host_does_not_read(matrix_row, full):
             return max(slewing_ms) - 1.0, stats["firmware_max_awake_us"] / 1000
 
     tries = 2
-    jitter, awake = worst(side_by_side(tries, attempt))
+    jitter, awake = worst(side_by_side(tries, attempt, AT_ONCE))
     matrix_row(30, fault=f"host does not read, {seconds} s", tries=tries, limit="loop jitter below 2 ms",
                worst=f"outputs {jitter:.2f} ms late, longest pass {awake:.2f} ms", clock="emulated")  # fmt: skip
     assert jitter < 2.0

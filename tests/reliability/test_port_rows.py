@@ -1,4 +1,4 @@
-"""Failure matrix, opening and arming: rows 7, 9, 23 and 24, on the compiled firmware behind the MEGA's bootloader."""
+"""Failure matrix, ports: rows 7, 9 and 24, on the compiled firmware behind the MEGA's bootloader."""
 
 import contextlib
 import os
@@ -6,34 +6,22 @@ import random
 import subprocess
 import sys
 import time
-from threading import Timer
 from types import SimpleNamespace
 
 import pytest
-from mega_in_run import Host, in_run, inject, side_by_side
+from mega_in_run import Host, in_stepped_run, inject, side_by_side, stepped_host
+from runtime_in_run import Run, Stand
 
 from modsoft.hil.emulator import EmulatedBoard, is_event, missing_packages
+from modsoft.hil.stepped import SteppedPort
 from modsoft.hil.trace import rises
 from modsoft.runtime import link, ports
-from modsoft.runtime import robot as robots
 from modsoft.runtime.board import Board
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, PortBusy, ProtocolMismatch
-from modsoft.runtime.protocol import (
-    PROTOCOL_HASH,
-    Arm,
-    Heartbeat,
-    Hello,
-    HelloReq,
-    Nack,
-    NackReason,
-    Parser,
-    State,
-    Status,
-    encode,
-)
+from modsoft.runtime.protocol import PROTOCOL_HASH, State
 
 missing = missing_packages("simavr")
-pytestmark = [pytest.mark.realtime, pytest.mark.skipif(bool(missing), reason=f"simavr needs {' '.join(missing)}")]
+pytestmark = pytest.mark.skipif(bool(missing), reason=f"simavr needs {' '.join(missing)}")
 
 
 def test_row_07_plugged_in_again_under_another_name(matrix_row, tmp_path, monkeypatch):
@@ -42,35 +30,76 @@ def test_row_07_plugged_in_again_under_another_name(matrix_row, tmp_path, monkey
 
     def attempt(number):
         serial_number = f"7523733353635180{number:04}"
-        with in_run() as (host, emulated):
+        with in_stepped_run() as (host, emulated):
             inject(emulated, "unplug")
             with pytest.raises(LostInRun):
                 host.go_on(1.0)
             host.board.close()
-            time.sleep(random.uniform(0.0, 1.0))
-            elsewhere = str(tmp_path / f"ttyACM{number}")
-            where[serial_number] = elsewhere
+            emulated.run(round(random.uniform(1.0, 1e6)), 0)
+            where[serial_number] = elsewhere = str(tmp_path / f"ttyACM{number}")
             plugged, since = inject(emulated, f"plug {elsewhere}")
             with pytest.raises(DeviceAbsent, match="no such port"):
                 ports.find_port(emulated.port)
-            with Board.open(ports.find_port(serial_number)) as board:
-                assert board.hello.boot_id != host.board.hello.boot_id
-                await_status(board, State.IDLE)
-                idle_s = time.monotonic() - plugged["mono_ns"] * 1e-9
-                time.sleep(0.5)
-                assert board.status.state == State.IDLE, "never by itself"
-                board.arm(Host.ROBOT)
-                assert board.status.state == State.ARMED
-                assert rises(emulated.trace, since) == 0
-                board.set_pressures(1, [Host.BAR] * 6)
-                await_status(board, State.RUNNING)
+            again = stepped_host(emulated, ports.find_port(serial_number))
+            assert again.board.hello.boot_id != host.board.hello.boot_id
+            await_state(again.board, State.IDLE)
+            idle_s = again.clock() - plugged["t_us"] * 1e-6
+            idle_until_s = again.clock() + 0.5
+            while again.clock() < idle_until_s:
+                again.board._pump()
+            assert again.board.status.state == State.IDLE, "never by itself"
+            again.board.arm(Host.ROBOT)
+            assert again.board.status.state == State.ARMED
+            assert rises(emulated.trace, since) == 0
+            again.go_on(0.1)
+            assert again.board.status.state == State.RUNNING
+            again.board.close()
             return idle_s
 
     tries = 20
-    idle_s = max(side_by_side(tries, attempt, 10))
+    idle_s = max(side_by_side(tries, attempt, 2))
     matrix_row(7, fault="plugged in again under another name", tries=tries, limit="IDLE in 8 s, 20 of 20",
-               worst=f"{idle_s:.2f} s", clock="host")  # fmt: skip
+               worst=f"{idle_s:.2f} s", clock="emulated")  # fmt: skip
     assert idle_s <= 8
+
+
+def await_state(board, state, limit_s=5.0):
+    board._wait(lambda: board.status is not None and board.status.state == state, board._clock() + limit_s)
+    assert board.status.state == state
+
+
+# modsoft-runtime on a machine with one MEGA: its serial number, its device, then the command line.
+WITH_ONE_MEGA = """
+import sys, types
+from serial.tools import list_ports
+number, device = sys.argv[1:3]
+mega = types.SimpleNamespace(device=device, description="Arduino", vid=0x2341, pid=0x0042, serial_number=number)
+list_ports.comports = lambda: [mega]
+del sys.argv[1:3]
+from modsoft.runtime.cli import main
+main()
+"""
+
+
+@pytest.mark.realtime
+def test_row_07_the_next_run_finds_the_board_by_its_serial_number(matrix_row, model_file, tmp_path):
+    elsewhere, number = str(tmp_path / "ttyACM1"), "75237333536351801234"
+    here = (sys.executable, "-c", WITH_ONE_MEGA, number, elsewhere)
+    with Stand() as stand:
+        with Run(stand, model_file, tmp_path / "first") as run:
+            run.wait_for(lambda: run.ticks() >= 2)
+            inject(stand.board, "unplug")
+            assert run.left()[0] == 74, run.said
+        _, since = inject(stand.board, f"plug {elsewhere}")
+        with Run(stand, model_file, tmp_path / "second", program=here) as run:
+            assert run.process.wait(30) == 69
+        assert f"there is an Arduino MEGA at {elsewhere}, which --port {number}" in run.said
+        assert not [event for event in stand.board.trace[since:] if event["event"] == "uart-open"], "nothing opened"
+        with Run(stand, model_file, tmp_path / "third", "--port", number, "--steps", "3", program=here) as run:
+            assert run.left()[0] == 0, run.said
+        assert run.log().meta["port"] == elsewhere
+    matrix_row(7, fault="plugged in again under another name: the next run", tries=1,
+               limit="74; 69 and where the board is; then found by --port SERIAL", worst="as it must")  # fmt: skip
 
 
 def mega(serial_number, device):
@@ -85,121 +114,40 @@ def await_status(board, state, limit_s=5.0):
 
 
 def test_row_09_host_would_talk_to_the_bootloader(matrix_row):
-    opens = 10
+    opens = 20
 
     def attempt(_):
-        with EmulatedBoard("simavr") as emulated:
-            for number in range(opens):
-                if number == opens - 1:  # its announcement is lost, and the host has to ask
-                    inject(emulated, "drop-tx 1")
-                    Timer(1.2, emulated.send, ["drop-tx 0"]).start()
-                Board.open(emulated.port).close()
-                time.sleep(random.uniform(0.0, 0.3))  # what was written last may still be on its way when it is reset
+        with EmulatedBoard("simavr", stepped=True) as emulated:
+            for _ in range(opens - 1):
+                stepped_host(emulated).board.close()
+                emulated.run(round(random.uniform(1.0, 3e5)), 0)  # what was written last may still be on its way
+            inject(emulated, "drop-tx 1")  # the announcement is lost, and the host has to ask
+            port = SteppedPort(emulated)
+            hear_from(port, 1.2, lambda: inject(emulated, "drop-tx 0"))
+            Board(port, "the emulated MEGA", port.clock, threaded=False).close()
+            emulated.run(1000, 0)
         opened = sum(event["event"] == "uart-open" for event in emulated.trace)
         assert opened == opens, "one reset each"
         assert emulated.summary["rx"] > 0, "and bytes are counted"
         return emulated.summary["rx_bootloader"]
 
-    found = sum(side_by_side(10, attempt, 10))
-    matrix_row(9, fault="host would talk to the bootloader", tries=10 * opens, limit="0 bytes in 100 opens",
+    found = sum(side_by_side(5, attempt, 2))
+    matrix_row(9, fault="host would talk to the bootloader", tries=5 * opens, limit="0 bytes in 100 opens",
                worst=f"{found} bytes", clock="none")  # fmt: skip
     assert found == 0
 
 
-# ---- Arming
+def hear_from(port, seconds, call):
+    """Have `call` done in the first read of the port that begins so long after now."""
+    read, due_s = port.read, port.clock() + seconds
 
+    def reading(size=1):
+        if port.clock() >= due_s:
+            port.read = read
+            call()
+        return read(size)
 
-def refusals(port):
-    """Ask a board behind `port`, heard for its second of heartbeats, for everything that it must not accept.
-
-    Yields (what was wrong, the NACK's reason or None, the board's state after it).
-    """
-    parser, heard, beat_s, tick = Parser(), [], 0.0, 0
-
-    def turn():
-        nonlocal beat_s, tick
-        if time.monotonic() >= beat_s:
-            beat_s, tick = time.monotonic() + 0.1, tick + 1
-            port.write(encode(Heartbeat(tick), 0, 0))
-        heard.extend(frame.message for frame in parser.feed(port.read(256)))
-
-    def wait(kind, limit_s=1.0):
-        until_s = time.monotonic() + limit_s
-        while not any(isinstance(message, kind) for message in heard) and time.monotonic() < until_s:
-            turn()
-        return next((message for message in heard if isinstance(message, kind)), None)
-
-    beat_s = float("inf")
-    hello = wait(Hello, 5.0)
-    beat_s = 0.0
-    armed_from_s = time.monotonic() + 1.3
-    while time.monotonic() < armed_from_s:
-        turn()
-    right = Arm(PROTOCOL_HASH, hello.boot_id, 1, 0x3F, hello.p_full)
-    wrong = [("protocol hash", right._replace(protocol_hash=PROTOCOL_HASH ^ 1 << bit)) for bit in range(32)]
-    wrong += [("channels", right._replace(channels=0x3F | 1 << bit)) for bit in range(hello.channels, 16)]
-    wrong += [("full scale", right._replace(p_full=hello.p_full ^ 1 << bit)) for bit in range(15)]
-    wrong += [("boot id", right._replace(boot_id=hello.boot_id ^ 1 << bit)) for bit in range(32)]
-    wrong += [("session", right._replace(new_session=session)) for session in (0, 2, 3, 128, 255)]
-    for what, arm in wrong:
-        heard.clear()
-        port.write(encode(arm, 0, 0))
-        nack = wait(Nack)
-        heard.clear()
-        yield what, nack and nack.reason, wait(Status).state
-    heard.clear()
-    port.write(encode(HelloReq(PROTOCOL_HASH ^ 1), 0, 0))
-    nack = wait(Nack)
-    yield "protocol hash of HELLO_REQ", nack and nack.reason, wait(Status).state
-    heard.clear()
-    port.write(encode(right, 0, 0))  # only that was wrong
-    wait(Status)
-    heard.clear()
-    yield "nothing", None, wait(Status).state
-
-
-REASONS = {
-    "protocol hash": NackReason.HASH,
-    "protocol hash of HELLO_REQ": NackReason.HASH,
-    "channels": NackReason.RANGE,
-    "full scale": NackReason.RANGE,
-    "boot id": NackReason.SESSION,
-    "session": NackReason.SESSION,
-}
-MISFITS = [
-    ("full_scale_bar = 3.0", "full_scale_bar = 10.0"),
-    ("p_min_bar = 0.08", "p_min_bar = 0.1"),
-    ("p_max_bar = 0.35", "p_max_bar = 0.3"),
-    ("slew_bar_per_s = 2.0", "slew_bar_per_s = 1.0"),
-    ("channel = 5", "channel = 11"),
-]
-
-
-def test_row_23_channels_or_protocol_hash_differ(matrix_row, monkeypatch):
-    with EmulatedBoard("simavr") as emulated, contextlib.closing(ports.open_port(emulated.port, 250000)) as port:
-        *refused, accepted = refusals(port)
-        for what, reason, state in refused:
-            assert (reason, state) == (REASONS[what], State.IDLE), what
-        assert accepted == ("nothing", None, State.ARMED)
-    with EmulatedBoard("simavr") as emulated:
-        host = Host(emulated.port)
-        for old, new in MISFITS:
-            text = robots.text_of("pneumatic-3")
-            assert old in text
-            with pytest.raises(ProtocolMismatch):
-                host.board.arm(robots.parse(text.replace(old, new, 1)))
-        host.board.close()
-        sent = Parser().feed(b"".join(data for _, data in host.written))
-        assert not [frame for frame in sent if isinstance(frame.message, Arm)]
-        foreign = range(0, 32, 8)
-        for bit in foreign:
-            monkeypatch.setattr(link, "PROTOCOL_HASH", PROTOCOL_HASH ^ 1 << bit)
-            with pytest.raises(ProtocolMismatch, match="flash the firmware of this version"):
-                Board.open(emulated.port)
-        assert rises(emulated.trace) == 0
-    tries = len(refused) + len(MISFITS) + len(foreign)
-    matrix_row(23, fault="channels, limits, session or protocol hash differ", tries=tries, limit="ARM refused, all",
-               worst=f"{tries} of {tries} refused", clock="none")  # fmt: skip
+    port.read = reading
 
 
 # ---- Not a port for us
@@ -243,6 +191,18 @@ def closed(emulated, times):
     emulated.wait_for(lambda _: sum(event["event"] == "uart-close" for event in emulated.trace) >= times, 5.0)
 
 
+@pytest.mark.realtime
+def test_row_24_port_busy_as_modsoft_runtime_tells_it(matrix_row, model_file, tmp_path):
+    with Stand() as stand, contextlib.closing(ports.open_port(stand.board.port, 250000)):
+        with Run(stand, model_file, tmp_path) as run:
+            assert run.process.wait(30) == 75
+        assert run.said.splitlines()[-1].startswith(f"modsoft-runtime: {stand.board.port} is in use by another program")
+        assert not run.armed()
+        assert stand.highest_bar() == 0.0
+    matrix_row(24, fault="port busy, modsoft-runtime", tries=1, limit="exit 75, one line", worst="as it must")
+
+
+@pytest.mark.realtime
 def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypatch):
     took_s = {}
 

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from modsoft.hil.emulator import EmulatedBoard
+from modsoft.hil.stepped import SteppedPort
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board import Board
 from modsoft.runtime.ports import open_port
@@ -31,21 +32,11 @@ class Host:
     PERIOD_S = 0.4
     ROBOT = robots.load("pneumatic-3")
 
-    def __init__(self, port_name, threaded=True):
-        self.written = []  # (monotonic seconds, bytes)
-        self.port = open_port(port_name, self.ROBOT.serial.baud)
-        self.port.write = self._recorded(self.port.write)
-        self.threaded = threaded
-        self.board = Board(self.port, port_name, threaded=threaded)
+    def __init__(self, port, threaded=True, clock=time.monotonic):
+        self.port, self.threaded, self.clock = port, threaded, clock
+        self.board = Board(port, "the emulated MEGA", clock, threaded)
         self.tick = 0
-        self.due_s = time.monotonic()
-
-    def _recorded(self, write):
-        def recorded(data):
-            self.written.append((time.monotonic(), data))
-            return write(data)
-
-        return recorded
+        self.due_s = clock()
 
     def start(self):
         """Arm, and go on until the board has said that every chamber is told `BAR`."""
@@ -56,8 +47,8 @@ class Host:
 
     def go_on(self, seconds):
         """The control loop for so long. Raises what `Board.check` raises, as soon as the loop can know."""
-        until_s = time.monotonic() + seconds
-        while (now_s := time.monotonic()) < until_s:
+        until_s = self.clock() + seconds
+        while (now_s := self.clock()) < until_s:
             self.board.check()
             if now_s >= self.due_s:
                 self.tick += 1
@@ -71,16 +62,37 @@ class Host:
 
 @contextlib.contextmanager
 def in_run(threaded=True):
-    """(host, emulated board) in mid-run, at a random phase of the period."""
+    """(host, emulated board) in mid-run in real time, at a random phase of the period."""
     with EmulatedBoard("simavr") as emulated:
         emulated.send("sensors 20")
-        host = Host(emulated.port, threaded)
+        host = Host(open_port(emulated.port, Host.ROBOT.serial.baud), threaded)
         try:
             host.start()
             host.go_on(random.uniform(0.0, Host.PERIOD_S))
             yield host, emulated
         finally:
             host.board._shut()
+
+
+@contextlib.contextmanager
+def in_stepped_run():
+    """(host, emulated board) in mid-run, at a random phase of the period, both on the board's own clock."""
+    with EmulatedBoard("simavr", stepped=True) as emulated:
+        emulated.send("sensors 20")
+        host = stepped_host(emulated)
+        try:
+            host.start()
+            host.go_on(random.uniform(0.0, Host.PERIOD_S))
+            host.port.idle(random.uniform(1e-6, 2e-3))  # anywhere in a pass of the firmware
+            yield host, emulated
+        finally:
+            host.port.close()
+
+
+def stepped_host(emulated, name=""):
+    """A host on the clock of a stepped board, connected; `name`: of its port where that is not its first one."""
+    port = SteppedPort(emulated, name)
+    return Host(port, threaded=False, clock=port.clock)
 
 
 def inject(emulated, command, name="command"):
@@ -96,9 +108,9 @@ def side_by_side(tries, attempt, at_once=5):
         return list(pool.map(attempt, range(tries)))
 
 
-def main(ports):
+def main(names):
     """Drive the boards at these ports for ever."""
-    hosts = side_by_side(len(ports), lambda number: Host(ports[number]), len(ports))
+    hosts = side_by_side(len(names), lambda number: Host(open_port(names[number], 250_000)), len(names))
     side_by_side(len(hosts), lambda number: hosts[number].start(), len(hosts))
     print("in run", flush=True)
     side_by_side(len(hosts), lambda number: hosts[number].go_on(3600.0), len(hosts))
