@@ -44,33 +44,52 @@ def study(out: Path, jobs: int | None, quick: bool, only: str | None) -> None:
 
     asked, folder, processes = plan.quick() if quick else plan.full(), Folder(out), jobs or cores()
     folder.make()
-    stages: dict[str, Callable[[], None]] = {
-        "collect": lambda: making.collect_all(asked, folder, processes),
-        "train": lambda: making.train_all(asked, folder, processes),
-        "export": lambda: making.export_all(asked, folder, processes),
-        "estimate": lambda: making.estimate_all(asked, folder, processes),
-        "fly": lambda: flights.fly_all(asked, folder, processes),
-        "floors": lambda: floors.find_all(asked, folder, processes),
+    makers = (making.collecting, making.training, making.exporting, making.estimating, flights.flying, floors.finding)
+    writers: dict[str, Callable[[], None]] = {
         "measure": lambda: measure.measure(asked, folder),
         "figures": lambda: figures.draw(asked, folder),
         "report": lambda: report.write(folder),
     }
     began_s = time.monotonic()
-    for name, stage in stages.items():
+    if only is None:
+        expected = [make(asked, folder, processes) for make in makers]
+        told = ", ".join(f"{stage.name} {_minutes(stage.expected_s(processes))}" for stage in expected)
+        whole = _minutes(sum(stage.expected_s(processes) for stage in expected))
+        click.echo(f"{out}: about {whole} to go with {processes} processes on as many free cores ({told})", err=True)
+    for name, make in zip(STAGES, makers, strict=False):
         if only in (None, name):
-            stage()
-    click.echo(f"{folder.report if only is None else only}: {time.monotonic() - began_s:.0f} s")
+            make(asked, folder, processes).run(processes)  # asked again: what is left depends on the stages before
+    for name, write in writers.items():
+        if only in (None, name):
+            write()
+    click.echo(f"{folder.report if only is None else only}: {_minutes(time.monotonic() - began_s)}")
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s"
 
 
 @cli.command("report")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False, exists=True))
-def write_report(folder: Path) -> None:
-    """Write FOLDER/report.md again, from its results.json and notes.md alone."""
+@click.option("--to", type=click.Path(path_type=Path, file_okay=False), help="Folder to publish in.  [default: FOLDER]")
+def write_report(folder: Path, to: Path | None) -> None:
+    """Write the report of the study in FOLDER again, from its results.json alone.
+
+    \b
+    Example:
+      modsoft-evaluate report study --to docs/study
+
+    With --to, results.json and the figures are copied there first. The notes are those of the folder that is written
+    to: TO/notes.md.
+    """
     from modsoft.study import report
     from modsoft.study.folder import Folder
 
-    report.write(Folder(folder))
-    click.echo(Folder(folder).report)
+    written = Folder(folder if to is None else to)
+    if to is not None:
+        report.publish(Folder(folder), written)
+    report.write(written)
+    click.echo(written.report)
 
 
 main = entry(cli, goes_on=True)

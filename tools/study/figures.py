@@ -100,6 +100,8 @@ def _bars(panel: Axes, modules: list[int], bars: dict[str, tuple[str, list[Cell 
         panel.errorbar(at, means, [np.zeros_like(spread), spread], fmt="none", ecolor="#333333", lw=0.7)
     panel.set_xticks(modules)
     panel.grid(axis="y", alpha=0.3)
+    panel.margins(y=0.3)
+    panel.set_ylim(bottom=0.0)
     panel.legend(fontsize=7)
 
 
@@ -119,6 +121,7 @@ def paths(folder: Folder, model: Model, modules: int) -> Figure:
             panel.set_aspect("equal", "datalim")
             panel.grid(alpha=0.3)
             panel.tick_params(labelsize=7)
+            panel.locator_params(nbins=4)
             panel.set_title(f"task {task}, module {module + 1}", fontsize=9)
         panels[row, 0].set_ylabel("v_y", fontsize=9)
     for panel in panels[-1]:

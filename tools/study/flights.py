@@ -22,9 +22,10 @@ from modsoft.runtime.controller import Controller
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import written
 from modsoft.runtime.trajectory import task
-from modsoft.study import disturb, making, work
+from modsoft.study import disturb, making
 from modsoft.study.folder import Folder
 from modsoft.study.plan import Plan, Run
+from modsoft.study.work import Stage, Told
 from modsoft.training import evaluate, fleet
 from modsoft.training import robots as parameters
 from modsoft.training.evaluate import Flight, Pilot, fly
@@ -35,7 +36,7 @@ TOGETHER = 16  # robots of a batch: two blocks of the kernel's widest vectors
 SHAPES: tuple[ModuleType, ...] = (
     actuation, configuration, controller, corrections, trajectory, evaluate, fleet, parameters, disturb,
 )  # fmt: skip
-STEP_S = 3.2e-3  # of one core, for a control step of one robot of four modules, about
+STEP_S = 4e-3  # of one core, for a control step of one robot of four modules, about
 
 Array = NDArray[np.float64]
 
@@ -47,17 +48,17 @@ class Kept(NamedTuple):
     desired: Array  # (K, N, 3)
 
 
-def fly_all(plan: Plan, folder: Folder, jobs: int) -> None:
+def flying(plan: Plan, folder: Folder, jobs: int) -> Stage:
     """runs/*.npz. A run is made again when its model changed, or anything else that shapes it."""
-    folder.make()
-    seals = {model: making.seal(folder, model) for model in {run.model for run in plan.runs}}
+    models = {run.model for run in plan.runs}
+    seals = {model: making.seal(folder, model) if folder.onnx(model).is_file() else "" for model in models}
     missing = [run for run in plan.runs if meta(folder.run(run)) != identity(plan, run, seals[run.model])]
     batches = [
         tuple(batch)
         for alike in _alike(missing)
         for batch in (alike[first : first + TOGETHER] for first in range(0, len(alike), TOGETHER))
     ]
-    work.spread("fly", partial(_fly, plan, folder), batches, partial(fly_s, plan), jobs)
+    return Stage("fly", batches, partial(_fly, plan, folder), partial(fly_s, plan))
 
 
 def fly_s(plan: Plan, batch: Sequence[Run]) -> float:
@@ -102,7 +103,7 @@ def desired_of(plan: Plan, name: str, modules: int) -> Array:
     return task(name, "cable", modules)[: plan.steps]
 
 
-def _fly(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: work.Told) -> None:
+def _fly(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: Told) -> None:
     first = batch[0]
     robot = robots.load(f"cable-{first.modules}")
     models = {run.model: Controller.load(folder.onnx(run.model)) for run in batch}

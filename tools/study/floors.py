@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.study import flights, work
+from modsoft.study import flights
 from modsoft.study.folder import Folder
 from modsoft.study.plan import Plan
+from modsoft.study.work import Stage, Told
 from modsoft.training.evaluate import Flight
 from modsoft.training.fleet import simulated
 
@@ -20,10 +21,10 @@ STEP_S = 0.35  # of one core, for a control step of four modules, about
 Array = NDArray[np.float64]
 
 
-def find_all(plan: Plan, folder: Folder, jobs: int) -> None:
+def finding(plan: Plan, folder: Folder, jobs: int) -> Stage:
     """floors/*.npz, each a run like any other: what the robot does under the best actions found."""
     missing = [each for each in plan.floors if flights.meta(folder.floor(*each)) != identity(plan, *each)]
-    work.spread("floors", partial(_find, plan, folder), missing, partial(find_s, plan), jobs)
+    return Stage("floors", missing, partial(_find, plan, folder), partial(find_s, plan))
 
 
 def find_s(plan: Plan, each: tuple[str, int]) -> float:
@@ -35,7 +36,7 @@ def identity(plan: Plan, task: str, modules: int) -> dict[str, Any]:
     return {"task": task, "modules": modules, "steps": steps, "seed": 0, "code_version": version("modsoft")}
 
 
-def _find(plan: Plan, folder: Folder, each: tuple[str, int], told: work.Told) -> None:
+def _find(plan: Plan, folder: Folder, each: tuple[str, int], told: Told) -> None:
     from modsoft.training.optimise import floor
 
     task, modules = each

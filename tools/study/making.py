@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,9 @@ from modsoft.runtime import artefact
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import written
-from modsoft.study import work
 from modsoft.study.folder import Folder
 from modsoft.study.plan import Data, Model, Plan
+from modsoft.study.work import Stage, Told
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import dataset, plants, train
 from modsoft.training.collect import collect
@@ -26,19 +27,19 @@ from modsoft.training.collect import collect
 TRAINED_PER_S = {"bilstm": 2000.0, "lstm": 6000.0, "module-lstm": 2500.0}
 SIMULATED_PER_S = 350.0
 EXPORT_S, ESTIMATE_S = 15.0, 15.0
+THERE_S = 1.0  # to prove that what is there is what was asked for
 
 
-def collect_all(plan: Plan, folder: Folder, jobs: int) -> None:
+def collecting(plan: Plan, folder: Folder, jobs: int) -> Stage:
     """data/*.h5. One data set after the other, each dealt out to the processes by the collection itself."""
-    missing = [each for each in plan.data if not folder.data(each.name).is_file()]
-    work.spread("collect", partial(_collect, folder, jobs), missing, collect_s, jobs=1)
+    return Stage("collect", plan.data, partial(_collect, folder, jobs), partial(collect_s, folder), alone=True)
 
 
-def collect_s(data: Data) -> float:
-    return data.samples / SIMULATED_PER_S
+def collect_s(folder: Folder, data: Data) -> float:
+    return THERE_S if folder.data(data.name).is_file() else data.samples / SIMULATED_PER_S
 
 
-def _collect(folder: Folder, jobs: int, data: Data, told: work.Told) -> None:
+def _collect(folder: Folder, jobs: int, data: Data, told: Told) -> None:
     robot, before = robots.load(data.robot), 0
 
     def progress(done: int, samples: int) -> None:
@@ -50,14 +51,14 @@ def _collect(folder: Folder, jobs: int, data: Data, told: work.Told) -> None:
     collect(robot, out, data.samples, data.strategy, data.seed, data.steps, jobs, plants.fastest(robot), progress)
 
 
-def train_all(plan: Plan, folder: Folder, jobs: int) -> None:
-    """models/*.pt. Those that are there are left to `train` too: it refuses one of other settings or data."""
-    work.spread("train", partial(_train, plan, folder), plan.models, partial(train_s, plan, folder), jobs)
+def training(plan: Plan, folder: Folder, jobs: int) -> Stage:
+    """models/*.pt."""
+    return Stage("train", plan.models, partial(_train, plan, folder), partial(train_s, plan, folder))
 
 
 def train_s(plan: Plan, folder: Folder, model: Model) -> float:
     if folder.checkpoint(model).is_file():
-        return 1.0
+        return THERE_S
     settings = settings_of(plan, model)
     return settings.iterations * settings.batch / TRAINED_PER_S[model.network]
 
@@ -68,7 +69,7 @@ def settings_of(plan: Plan, model: Model) -> train.Settings:
     return train.Settings(**{**train.BY_KIND["cable"], **asked})
 
 
-def _train(plan: Plan, folder: Folder, model: Model, told: work.Told) -> None:
+def _train(plan: Plan, folder: Folder, model: Model, told: Told) -> None:
     share = None
 
     def progress(now: train.Progress) -> None:
@@ -78,22 +79,22 @@ def _train(plan: Plan, folder: Folder, model: Model, told: work.Told) -> None:
         share = now.share
 
     data = [dataset.read(folder.data(name)) for name in plan.mixes[model.data]]
-    train.train(data[0], folder.checkpoint(model), settings_of(plan, model), progress)
+    train.train(data, folder.checkpoint(model), settings_of(plan, model), progress)
 
 
-def export_all(plan: Plan, folder: Folder, jobs: int) -> None:
+def exporting(plan: Plan, folder: Folder, jobs: int) -> Stage:
     """models/*.onnx of all models that fly; made again where the checkpoint is younger."""
     flown = {run.model for run in plan.runs}
-    missing = [model for model in plan.models if model in flown and not _is_exported(folder, model)]
-    work.spread("export", partial(_export, folder), missing, lambda model: EXPORT_S, jobs)
+    missing = [each for each in plan.models if each in flown and _older(folder.onnx(each), folder.checkpoint(each))]
+    return Stage("export", missing, partial(_export, folder), lambda model: EXPORT_S)
 
 
-def _is_exported(folder: Folder, model: Model) -> bool:
-    out = folder.onnx(model)
-    return out.is_file() and out.stat().st_mtime_ns >= folder.checkpoint(model).stat().st_mtime_ns
+def _older(made: Path, source: Path) -> bool:
+    """Whether `made` has to be made (again) from `source`."""
+    return not (made.is_file() and source.is_file() and made.stat().st_mtime_ns >= source.stat().st_mtime_ns)
 
 
-def _export(folder: Folder, model: Model, told: work.Told) -> None:
+def _export(folder: Folder, model: Model, told: Told) -> None:
     from modsoft.export.write import export
 
     export(folder.checkpoint(model), folder.onnx(model))
@@ -104,19 +105,14 @@ def seal(folder: Folder, model: Model) -> str:
     return hashlib.sha256(artefact.read(folder.onnx(model))).hexdigest()
 
 
-def estimate_all(plan: Plan, folder: Folder, jobs: int) -> None:
+def estimating(plan: Plan, folder: Folder, jobs: int) -> Stage:
     """estimates/*.npz: the errors of Table 1. All models are tried on the test part of the same data, the paper's, so
     that they can be compared; for one trained on those data the part is the one that its training left out."""
-    missing = [model for model in plan.models if not _is_estimated(folder, model)]
-    work.spread("estimate", partial(_estimate, plan, folder), missing, lambda model: ESTIMATE_S, jobs)
+    missing = [each for each in plan.models if _older(folder.estimate(each), folder.checkpoint(each))]
+    return Stage("estimate", missing, partial(_estimate, plan, folder), lambda model: ESTIMATE_S)
 
 
-def _is_estimated(folder: Folder, model: Model) -> bool:
-    out = folder.estimate(model)
-    return out.is_file() and out.stat().st_mtime_ns >= folder.checkpoint(model).stat().st_mtime_ns
-
-
-def _estimate(plan: Plan, folder: Folder, model: Model, told: work.Told) -> None:
+def _estimate(plan: Plan, folder: Folder, model: Model, told: Told) -> None:
     checkpoint = checkpoints.load(folder.checkpoint(model))
     provenance: dict[str, Any] = checkpoint["provenance"]
     (name,) = plan.mixes["paper"]

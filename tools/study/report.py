@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from typing import Any
 
+from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import written
 from modsoft.study import figures, measure, tables
 from modsoft.study.cells import table
@@ -45,6 +47,19 @@ def write(folder: Folder) -> None:
     text = "\n".join(lines(measure.load(folder.results), _notes(folder))) + "\n"
     with written(folder.report) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def publish(study: Folder, to: Folder) -> None:
+    """Copies what people read of a study, its numbers and figures; runs, models and data stay where they are."""
+    measure.load(study.results)
+    to.figures.mkdir(parents=True, exist_ok=True)
+    pictures = [study.figures / f"{name}.png" for name in figures.CAPTIONS]
+    missing = [picture.name for picture in pictures if not picture.is_file()]
+    if missing:
+        raise ModelError(f"{study.figures}: no {', '.join(missing)}; modsoft-evaluate study --only figures draws them")
+    for source, copy in [(study.results, to.results), *((each, to.figures / each.name) for each in pictures)]:
+        with written(copy) as temporary:
+            shutil.copyfile(source, temporary)
 
 
 def _notes(folder: Folder) -> str:

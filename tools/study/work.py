@@ -6,6 +6,7 @@ import multiprocessing
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from multiprocessing.sharedctypes import Synchronized
 from typing import Any
 
@@ -19,21 +20,35 @@ LINE = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 Told = Callable[[float], None]  # adds a share of an item's cost
 
 
-def spread(
-    what: str, do: Callable[[Any, Told], None], items: Sequence[Any], cost_s: Callable[[Any], float], jobs: int
-) -> None:
-    """do(item, told) for every item, in `jobs` processes; the dearest first, so that none is left over at the end.
+@dataclass(frozen=True)
+class Stage:
+    """What is left to do of one kind. do(item, told) makes what an item stands for and can tell how far it is.
 
-    cost_s: seconds that an item takes on one core, about. A `do` that tells nothing counts when an item is done.
+    cost_s: seconds that an item takes on one core, about.
     """
-    if not items:
-        print(f"{what}: all there", file=sys.stderr)
-        return
-    priced = sorted(((cost_s(item), index) for index, item in enumerate(items)), reverse=True)
-    done = multiprocessing.get_context("spawn").Value("d", 0.0)
-    with _Bar(what, sum(cost for cost, _ in priced), len(items), done) as bar:
-        for _ in workers.run(_Counted(do, done), [(items[index], cost) for cost, index in priced], jobs):
-            bar.finished += 1
+
+    name: str
+    items: Sequence[Any]
+    do: Callable[[Any, Told], None]
+    cost_s: Callable[[Any], float]
+    alone: bool = False  # one item after the other, in this process, since each uses all processes itself
+
+    def expected_s(self, jobs: int) -> float:
+        """Of wall clock, about: no sooner than the dearest item is done."""
+        costs = [self.cost_s(item) for item in self.items]
+        return sum(costs) / jobs if self.alone or not costs else max(sum(costs) / jobs, *costs)
+
+    def run(self, jobs: int) -> None:
+        """Every item, in `jobs` processes; the dearest first, so that none is left over at the end."""
+        if not self.items:
+            print(f"{self.name}: all there", file=sys.stderr)
+            return
+        priced = sorted(((self.cost_s(item), index) for index, item in enumerate(self.items)), reverse=True)
+        order = [(self.items[index], cost) for cost, index in priced]
+        done = multiprocessing.get_context("spawn").Value("d", 0.0)
+        with _Bar(self.name, sum(cost for cost, _ in priced), len(order), done) as bar:
+            for _ in workers.run(_Counted(self.do, done), order, 1 if self.alone else jobs):
+                bar.finished += 1
 
 
 class _Counted:

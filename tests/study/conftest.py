@@ -1,0 +1,53 @@
+"""One study in miniature for all tests of this part, made by the command that a user would type."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+COMMAND = Path(sys.executable).with_name("modsoft-evaluate")
+
+
+@pytest.fixture(scope="session")
+def evaluate():
+    """evaluate(*arguments) starts modsoft-evaluate in a process group of its own."""
+
+    def start(*arguments):
+        return subprocess.Popen(
+            [COMMAND, *arguments],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )  # fmt: skip
+
+    return start
+
+
+@pytest.fixture(scope="session")
+def ended(evaluate):
+    """ended(*arguments) waits for modsoft-evaluate; gives exit code, standard output and error."""
+
+    def run(*arguments):
+        process = evaluate(*arguments)
+        output, error = process.communicate()
+        return process.returncode, output, error
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def made_study(tmp_path_factory, ended):
+    """The whole study in short form. Not to be changed."""
+    folder = tmp_path_factory.mktemp("made") / "study"
+    code, _, error = ended("study", "--quick", "--jobs", "1", "--out", folder)
+    assert code == 0, error
+    return folder
+
+
+@pytest.fixture
+def study(made_study, tmp_path):
+    """A copy of it, to damage."""
+    shutil.copytree(made_study, tmp_path / "study")
+    return tmp_path / "study"
