@@ -7,8 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent / "shared"))
+
+# A busy machine is no defect: what is judged against the wall clock says so with a marker.
+settings.register_profile("modsoft", deadline=None)
+settings.load_profile("modsoft")
 
 
 @pytest.fixture(scope="session")

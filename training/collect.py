@@ -7,9 +7,9 @@ end, one after the other, so that memory does not grow with their number.
 
 from __future__ import annotations
 
+import functools
 import glob
 import hashlib
-import itertools
 import json
 import shutil
 from collections.abc import Callable
@@ -25,68 +25,49 @@ from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_writable
 from modsoft.runtime.robot import Robot
 from modsoft.training import dataset, plants
+from modsoft.training.actions import draw_actions, stage_borders
 from modsoft.training.backends import BACKENDS
 from modsoft.training.dataset import Episode
-from modsoft.training.plants import Plant, Simulate
+from modsoft.training.plants import Plant, Simulate, Variation
 from modsoft.training.robots import PLANTS
 from modsoft.training.shards import Shards, refuse_other
 
-STRATEGIES = ("staged", "random")
+ALIKE = 8  # episodes of a varied data set that have the same robot: the fleet's lanes
+STIFFNESS_OFF = 0.15  # of a module's stiffness, at most
+PAYLOAD_MODULES = 4.0  # at the tip, in modules' weight, at most
+VARIED = 1  # what tells these random numbers from an episode's own
 MOST_ATTEMPTS = 10  # a robot that is not finite so often in a row is broken, not unlucky
 
 Array = NDArray[np.float64]
 
 
-def stage_borders(strategy: str, modules: int, steps: int) -> NDArray[np.int64]:
-    """First step of each stage and the end: N stages of equal length where staged, one where random."""
-    stages = modules if strategy == "staged" else 1
-    return np.round(np.linspace(0, steps, stages + 1)).astype(np.int64)
-
-
-def draw_actions(robot: Robot, strategy: str, steps: int, rng: np.random.Generator) -> Array:
-    """Random actions (steps, N, A) in [-1, 1], uniform over the range.
-
-    staged: in stage s = 0..N-1 the first N - s modules share one sequence, every further module has its own (section
-    2.2, for any N); random: every module has its own, always.
-
-    Where the robot file bounds the step between two control periods, the sequence is a random walk reflected at the
-    ends of the range: its steps never exceed the bound and in the long run it is exactly uniform, ends included. Each
-    walk changes its pace now and then, so that slow motion is seen as well as fast. It goes on over stage borders,
-    where the bound holds too.
-    """
-    shape = (steps, robot.modules, robot.action_size)
-    largest = robot.limits.largest_actuation_step
-    drawn = rng.uniform(-1.0, 1.0, shape)
-    if largest < 2.0:
-        drawn *= largest * _paces(shape, rng)
-    if strategy == "staged":
-        borders = stage_borders(strategy, robot.modules, steps)
-        for stage, (begin, end) in enumerate(itertools.pairwise(borders)):
-            alike = robot.modules - stage
-            drawn[begin:end, 1:alike] = drawn[begin:end, :1]
-    return drawn if largest >= 2.0 else _reflected_walk(drawn)
-
-
-def _paces(shape: tuple[int, int, int], rng: np.random.Generator) -> Array:
-    """Share of the largest step in (0, 1] that each walk (steps, N, A) keeps to; changes every 20 steps on average.
-
-    Cubed, so that half of them are below an eighth: tasks move slowly, and friction shows when a robot does.
-    """
-    paces = rng.uniform(0.0, 1.0, shape) ** 3
-    for step, changes in enumerate(rng.uniform(size=shape) < 0.05):
-        if step > 0:
-            paces[step] = np.where(changes, paces[step], paces[step - 1])
-    return paces
-
-
-def _reflected_walk(increments: Array) -> Array:
-    """Sums increments (steps, ...) of at most 2 from 0 and folds the sum back into [-1, 1]."""
-    unfolded = np.cumsum(increments, axis=0) + 1.0
-    return 1.0 - np.abs(unfolded % 4.0 - 2.0)
+def variation_of(recipe: dict[str, Any], robot: Robot, index: int) -> Variation | None:
+    """How the robot of an episode differs from the drawing: where the strategy is varied, every eight episodes have
+    another robot, of which three in ten carry nothing. So the network learns to see in the history what it drives."""
+    if recipe["strategy"] != "varied":
+        return None
+    rng = np.random.default_rng(np.random.SeedSequence(recipe["seed"], spawn_key=(index // ALIKE, 0, VARIED)))
+    stiffness = 1.0 + STIFFNESS_OFF * rng.uniform(-1.0, 1.0, robot.modules)
+    payload_modules = rng.uniform(0.0, PAYLOAD_MODULES) if rng.uniform() < 0.7 else 0.0
+    return Variation(tuple(stiffness.tolist()), payload_modules * PLANTS[robot.robot.kind].module_kg)
 
 
 def episodes(recipe: dict[str, Any], robot: Robot, indices: list[int], simulate: Simulate) -> list[Episode]:
     """The episode of each index. One that is not finite is never kept: the robot is drawn again, and it is counted."""
+    of_variation: dict[Variation | None, list[int]] = {}
+    for index in indices:
+        of_variation.setdefault(variation_of(recipe, robot, index), []).append(index)
+    made: dict[int, Episode] = {}
+    for variation, alike in of_variation.items():
+        drawn = simulate if variation is None else functools.partial(simulate, variation=variation)
+        made |= _alike(recipe, robot, alike, drawn)
+    return [made[index] for index in indices]
+
+
+def _alike(
+    recipe: dict[str, Any], robot: Robot, indices: list[int], simulate: Callable[[Robot, Array], Array]
+) -> dict[int, Episode]:
+    """Episodes of robots that are all alike, by index."""
     made: dict[int, Episode] = {}
     for attempt in range(MOST_ATTEMPTS):
         left = [index for index in indices if index not in made]
@@ -105,7 +86,7 @@ def episodes(recipe: dict[str, Any], robot: Robot, indices: list[int], simulate:
         raise ModelError(
             f"episode {lost[0]}: not finite {MOST_ATTEMPTS} times in a row; this robot cannot be simulated"
         )
-    return [made[index] for index in indices]
+    return made
 
 
 def recipe_of(robot: Robot, strategy: str, seed: int, steps: int, plant: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-MUON_RATE = 3.0  # of Adam's learning rate
+MUON_RATE = 5.0  # of Adam's learning rate
 
 
 class Optimiser:

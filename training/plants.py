@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +15,24 @@ from modsoft.training.fleet import Arms, Fleet
 from modsoft.training.robots import PASCAL_PER_BAR, PLANTS
 
 Array = NDArray[np.float64]
-Simulate = Callable[[Robot, Array], Array]
+
+
+class Variation(NamedTuple):
+    """How a robot differs from the drawing."""
+
+    stiffness: tuple[float, ...]  # factor of each module
+    tip_payload_kg: float
+
+
+class Simulate(Protocol):
+    """Robot and actions (B, K, N, A) of episodes from rest -> configurations (B, K + 1, N, 3), not finite where a robot
+    was lost; what one episode gives does not depend on the others beside it."""
+
+    def __call__(self, robot: Robot, actions: Array, *, variation: Variation | None = None) -> Array: ...
 
 
 class Plant(NamedTuple):
-    """simulate: robot and actions (B, K, N, A) of episodes from rest -> configurations (B, K + 1, N, 3), not finite
-    where a robot was lost; what one episode gives does not depend on the others beside it."""
+    """A simulator that data can be collected from."""
 
     name: str  # goes into the data set: two plants round differently
     simulate: Simulate
@@ -50,14 +61,22 @@ def named(name: str, robot: Robot) -> Plant:
     return Plant(name, functools.partial(by_fleet, variant=name.removeprefix("fleet-")), together=8)
 
 
-def by_fleet(robot: Robot, actions: Array, variant: str | None = None) -> Array:
+def by_fleet(
+    robot: Robot, actions: Array, variant: str | None = None, *, variation: Variation | None = None
+) -> Array:
     """Robots side by side in compiled code."""
-    return _run(Fleet(robot.robot.kind, robot.modules, len(actions), variant=variant), actions, robot.loop.period_s)
+    fleet = Fleet(robot.robot.kind, robot.modules, len(actions), variant=variant, **_differences(variation))
+    return _run(fleet, actions, robot.loop.period_s)
 
 
-def by_elastica(robot: Robot, actions: Array) -> Array:
+def by_elastica(robot: Robot, actions: Array, *, variation: Variation | None = None) -> Array:
     """One robot after the other in PyElastica, the reference."""
-    return _run(Arms(robot.robot.kind, robot.modules, len(actions)), actions, robot.loop.period_s)
+    arms = Arms(robot.robot.kind, robot.modules, len(actions), **_differences(variation))
+    return _run(arms, actions, robot.loop.period_s)
+
+
+def _differences(variation: Variation | None) -> dict[str, Any]:
+    return {} if variation is None else variation._asdict()
 
 
 def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:

@@ -175,8 +175,8 @@ def _robot(data: Sequence[DataSet]) -> dict[str, Any]:
     for each in data[1:]:
         if each.recipe["robot"] != robot:
             raise ModelError(
-                f"data sets of different robots, {data[0].robot.name} and {each.robot.name} (or of one with other limits "
-                "or another rate); a model is trained on data of one robot"
+                f"data sets of different robots, {data[0].robot.name} and {each.robot.name} (or of one with other "
+                "limits or another rate); a model is trained on data of one robot"
             )
     return robot
 

@@ -23,7 +23,8 @@ STAND_IN = """
     from modsoft.runtime.configuration import from_angles_deg
     from modsoft.runtime.errors import ModelError
     from modsoft.training import backends
-    from modsoft.training.collect import collect, draw_actions
+    from modsoft.training.actions import draw_actions
+    from modsoft.training.collect import collect
     from modsoft.training.plants import Plant
 
     class StandIn:

@@ -1,6 +1,5 @@
-"""Actions of both strategies, and collection that survives being killed."""
+"""Collection that survives being killed."""
 
-import itertools
 import json
 import signal
 import subprocess
@@ -11,11 +10,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from small_robots import of_modules
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.actuation import limited
+from modsoft.runtime.configuration import from_angles_deg
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.training import collect as c
 from modsoft.training import dataset
@@ -39,87 +37,6 @@ simulate = namespace["simulate"]
 
 def plant(function=simulate, together: int = 1) -> Plant:
     return Plant("stand-in", function, together)
-
-
-def of_modules(kind: str, modules: int, largest: float = 2.0) -> robots.Robot:
-    table = {
-        "robot": {"name": "r", "kind": kind, "modules": modules},
-        "loop": {"hz": 2.5},
-        "limits": {"largest_actuation_step": largest},
-    }
-    if kind == "pneumatic":
-        table["valve"] = {"model": "v", "full_scale_bar": 1.0, "signal": "0-10 V"}
-        sides = [(m, s) for m in range(1, modules + 1) for s in "+-"]
-        table["chambers"] = [{"module": m, "side": s, "channel": i} for i, (m, s) in enumerate(sides)]
-    return robots.from_dict(table)
-
-
-def draw(robot, strategy, steps, seed=0):
-    return c.draw_actions(robot, strategy, steps, np.random.default_rng(seed))
-
-
-@given(st.integers(2, 8), st.integers(1, 300), st.sampled_from([0.1, 0.4, 1.9, 2.0]), st.integers(0, 99))
-def test_staged_actions_are_alike_in_the_first_modules_of_each_stage(modules, steps, largest, seed):
-    actions = draw(of_modules("cable", modules, largest), "staged", steps, seed)
-    assert actions.shape == (steps, modules, 2)
-    assert np.all(np.abs(actions) <= 1.0)
-    borders = c.stage_borders("staged", modules, steps)
-    assert (borders[0], borders[-1]) == (0, steps)
-    assert np.ptp(np.diff(borders)) <= 1
-    for stage, (begin, end) in enumerate(itertools.pairwise(borders)):
-        piece = actions[begin:end]
-        alike = modules - stage
-        assert np.array_equal(piece[:, :alike], np.repeat(piece[:, :1], alike, axis=1))
-        for module in range(alike, modules):
-            for other in range(module):
-                assert not np.any(piece[:, module] == piece[:, other])
-
-
-@given(st.integers(2, 5), st.sampled_from([0.05, 0.4, 1.0]), st.sampled_from(c.STRATEGIES), st.integers(0, 99))
-def test_the_loop_would_send_every_drawn_action_as_it_is(modules, largest, strategy, seed):
-    actions = draw(of_modules("cable", modules, largest), strategy, 200, seed)
-    previous = np.zeros_like(actions[0])  # every episode starts with the actuation at rest
-    for action in actions:
-        np.testing.assert_allclose(limited(action, previous, largest), action, rtol=0, atol=1e-12)
-        previous = action
-
-
-def shares(values: np.ndarray) -> np.ndarray:
-    """Of each tenth of the range."""
-    found, _ = np.histogram(values, bins=10, range=(-1, 1))
-    return found / values.size
-
-
-def test_unbounded_actions_are_uniform():
-    drawn = draw(of_modules("cable", 2), "random", 20000)
-    np.testing.assert_allclose(shares(drawn), 0.1, atol=0.01)
-
-
-@given(st.floats(0.01, 1.9))
-def test_a_reflected_walk_keeps_a_uniform_distribution_whatever_its_step(largest):
-    rng = np.random.default_rng(0)
-    increments = rng.uniform(-largest, largest, (5, 20000))
-    increments[0] = rng.uniform(-1, 1, 20000)  # walkers all over the range
-    for places in c._reflected_walk(increments):
-        np.testing.assert_allclose(shares(places), 0.1, atol=0.01)
-
-
-def test_bounded_actions_cover_the_range_in_a_data_set_of_the_usual_size():
-    robot = of_modules("pneumatic", 3, 0.4)
-    drawn = np.stack([draw(robot, "staged", 300, seed) for seed in range(50)])
-    for module in range(3):
-        found = shares(drawn[:, :, module])
-        assert found.min() > 0.04  # the ends of the range; 0.059 was seen
-        assert found.max() < 0.2  # around rest, where every episode begins; 0.171 was seen
-
-
-def test_random_actions_differ_between_modules_and_change_slowly_and_fast():
-    actions = draw(of_modules("cable", 3, 0.4), "random", 2000)
-    steps = np.abs(np.diff(actions, axis=0))
-    assert np.mean(steps < 0.02) > 0.4
-    assert np.mean((steps > 0.02) & (steps < 0.1)) > 0.1
-    assert np.mean(steps > 0.2) > 0.02
-    assert not np.any(actions[:, 0] == actions[:, 1])
 
 
 def test_an_episode_depends_on_seed_and_index_alone():
@@ -382,3 +299,38 @@ def test_memory_does_not_grow_with_the_number_of_samples(tmp_path):
         (tmp_path / "d.h5").unlink()
     assert sizes_mib[1] - sizes_mib[0] > 20
     assert peaks_mib[1] - peaks_mib[0] < 5
+
+
+def test_the_robots_of_a_varied_data_set_differ_from_the_drawing_eight_episodes_alike():
+    robot = robots.load("cable-4")
+    recipe = c.recipe_of(robot, "varied", 5, 30, "stand-in")
+    found = [c.variation_of(recipe, robot, index) for index in range(400)]
+    assert len(set(found)) == 50
+    assert all(len(set(found[i : i + 8])) == 1 for i in range(0, 400, 8))
+    stiffness = np.array([each.stiffness for each in found])
+    assert stiffness.shape == (400, 4)
+    assert 0.85 <= stiffness.min() < 0.9
+    assert 1.1 < stiffness.max() <= 1.15
+    payloads = np.array([each.tip_payload_kg for each in found[::8]])
+    module_kg = 1050 * np.pi * 0.01**2 * 0.05
+    assert 0.1 < np.mean(payloads == 0.0) < 0.5
+    assert 2.5 * module_kg < payloads.max() < 4 * module_kg
+    assert c.variation_of(c.recipe_of(robot, "smooth", 5, 30, "stand-in"), robot, 0) is None
+
+
+def test_an_episode_is_simulated_on_its_own_robot_whatever_is_asked_for_with_it():
+    robot = robots.load("cable-4")
+    recipe = c.recipe_of(robot, "varied", 5, 6, "stand-in")
+
+    def stiff(robot, actions, *, variation):
+        angles = np.zeros((len(actions), 7, 4))
+        angles[:, 1:] = 10.0 * actions[..., 0] / np.array(variation.stiffness)
+        return from_angles_deg(angles)
+
+    together = c.episodes(recipe, robot, [3, 9, 4], stiff)
+    for index, episode in zip([3, 9, 4], together, strict=True):
+        (alone,) = c.episodes(recipe, robot, [index], stiff)
+        np.testing.assert_array_equal(episode.configuration, alone.configuration)
+        factors = np.array(c.variation_of(recipe, robot, index).stiffness)
+        expected = from_angles_deg(10.0 * episode.action[..., 0] / factors)
+        np.testing.assert_allclose(episode.configuration[1:], expected, atol=1e-12)

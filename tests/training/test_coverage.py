@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import from_angles_deg
 from modsoft.runtime.errors import ModelError, OutputError, UsageError
-from modsoft.training import collect, coverage, dataset
+from modsoft.training import actions, coverage, dataset
 from modsoft.training.arm import Arm
 
 
@@ -59,12 +59,12 @@ def write(path, name: str, strategy: str, episodes: int = 20, steps: int = 150) 
     """A data set whose modules take the direction of their action at once."""
     robot = robots.load(name)
     rng = np.random.default_rng(0)
-    action = np.stack([collect.draw_actions(robot, strategy, steps, rng) for _ in range(episodes)])
+    action = np.stack([actions.draw_actions(robot, strategy, steps, rng) for _ in range(episodes)])
     across = np.zeros((episodes, steps + 1, robot.modules, 2))
     across[:, 1:, :, : robot.action_size] = 0.5 * action
     along = np.sqrt(1 - np.sum(across**2, axis=-1, keepdims=True))
     recipe = {"robot": robot.to_dict(), "strategy": strategy, "steps": steps}
-    borders = collect.stage_borders(strategy, robot.modules, steps)
+    borders = actions.stage_borders(strategy, robot.modules, steps)
     dataset.write(dataset.DataSet(recipe, np.concatenate([across, along], -1), action, borders, 0), path)
 
 

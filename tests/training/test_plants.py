@@ -13,6 +13,7 @@ import pytest
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import ModsoftError, RobotFileError, UsageError
 from modsoft.training import arm, collect, dataset, kernel, plants
+from modsoft.training.actions import draw_actions
 from modsoft.training.fleet import Fleet
 
 needs_fleet = pytest.mark.skipif(not kernel.variants(), reason="the fleet's kernel is not built here")
@@ -21,7 +22,7 @@ needs_fleet = pytest.mark.skipif(not kernel.variants(), reason="the fleet's kern
 def draw(name: str, count: int, steps: int) -> tuple[robots.Robot, np.ndarray]:
     robot = robots.load(name)
     rng = np.random.default_rng(3)
-    return robot, np.stack([collect.draw_actions(robot, "random", steps, rng) for _ in range(count)])
+    return robot, np.stack([draw_actions(robot, "random", steps, rng) for _ in range(count)])
 
 
 def test_elastica_starts_every_episode_from_rest():
