@@ -50,7 +50,7 @@ coverage: $(INSTALLED)
 mutation: $(INSTALLED)
 	.venv/bin/python tools/mutate.py
 
-# Coverage-guided fuzzing of the firmware's parser and controller for FUZZ_SECONDS; needs clang, which it installs or asks for.
+# Coverage-guided fuzzing of the firmware for FUZZ_SECONDS; needs clang, which it installs or asks for.
 FUZZ_SECONDS ?= 60
 fuzz:
 	tools/fuzz/run.sh $(FUZZ_SECONDS)

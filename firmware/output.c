@@ -27,7 +27,7 @@ void output_step(struct output_stage *stage, const int16_t targets[PROTOCOL_CHAN
 void output_dump(struct output_stage *stage) { memset(stage->applied, 0, sizeof stage->applied); }
 
 bool output_is_vented(const struct output_stage *stage) {
-  for (uint8_t channel = 0; channel < CHANNELS_USED; channel++) {
+  for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
     if (stage->applied[channel] != 0) {
       return false;
     }

@@ -53,7 +53,7 @@ def test_dump_is_at_once(sanitised):
 def test_vented_is_every_channel_at_zero(sanitised):
     sanitised.output_is_vented.restype = ctypes.c_bool
     assert sanitised.output_is_vented(ctypes.byref(OutputStage()))
-    for channel in range(11):
+    for channel in range(12):
         stage = OutputStage()
         stage.applied[channel] = 1
         assert not sanitised.output_is_vented(ctypes.byref(stage))
