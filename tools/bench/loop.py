@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import multiprocessing as mp
 import os
 import time
@@ -118,7 +119,7 @@ def measured(seconds: float, busy_processes: int, core: int) -> list[dict[str, A
         begin_s = start_s + SPREAD_S * place / len(loops)
         ours.send((begin_s, begin_s + seconds))
     rows = [
-        {"busy": busy_processes, "hz": hz, "pace": pace, **figures(ours.recv(), 1 / hz, round(seconds * hz))}
+        {"busy": busy_processes, "hz": hz, "pace": pace, **figures(ours.recv(), 1 / hz, math.ceil(seconds * hz - 1e-9))}
         for pace, hz, ours, _ in loops
     ]
     for process in others:
@@ -158,9 +159,10 @@ def table(result: dict[str, Any]) -> str:
 
 @click.command(help=__doc__)
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all figures here, one JSON object.")
-@click.option("--quick", is_flag=True, help="10 s in place of 7 minutes each: less than a minute.")
-def main(json_file: Path | None, quick: bool) -> None:
-    seconds = 10.0 if quick else 420.0
+@click.option("--seconds", default=420.0, show_default=True, help="Of the free and of the busy core each.")
+@click.option("--quick", is_flag=True, help="10 seconds each: less than a minute.")
+def main(json_file: Path | None, seconds: float, quick: bool) -> None:
+    seconds = 10.0 if quick else seconds
     core = max(os.sched_getaffinity(0))
     about = {**host(), "load_average": os.getloadavg()[0], "seconds": seconds, "core": core}
     about.pop("name")
