@@ -16,7 +16,9 @@ from modsoft.runtime.errors import DeviceAbsent, PortBusy, UsageError
 MEGA_IDENTITIES = {(0x2341, 0x0042), (0x2341, 0x0010), (0x2341, 0x0242), (0x2A03, 0x0042), (0x2A03, 0x0010)}
 BY_ID = Path("/dev/serial/by-id")
 READ_WAIT_S = 0.005  # how long the I/O thread sleeps in a read; bounds how late it writes
-WRITE_WAIT_S = 0.1
+# The board's own link time-out. pyserial also counts the time for which this process was held up by others, and a
+# shorter wait took that for a port that takes nothing.
+WRITE_WAIT_S = 0.3
 
 
 class PortInfo(NamedTuple):
