@@ -115,6 +115,29 @@ def test_row_12_nobody_says_vented_for_a_board_that_is_not_heard(matrix_row, mod
                limit='"vented" never said, same exit code', worst="never said")  # fmt: skip
 
 
+def test_row_12_a_signal_before_arming_opens_no_valve(matrix_row, full, model_file, tmp_path):
+    """From the tracker's first frame on: while the board is looked for, and between that and arming."""
+    phases_s = np.linspace(0.0, 1.0, 20 if full else 3)
+    attempts = [(name, phase_s) for name in ("SIGINT", "SIGTERM", "SIGHUP") for phase_s in phases_s]
+
+    def attempt(number):
+        name, phase_s = attempts[number]
+        cause, code, _ = CAUSES[name]
+        with Stand() as stand, Run(stand, model_file, tmp_path / str(number)) as run:
+            run.wait_for(lambda: "hangs at" in run.said)
+            time.sleep(phase_s)
+            began_ns = time.monotonic_ns()
+            cause(run)
+            assert run.process.wait(10) == code, run.said
+            took_s = (time.monotonic_ns() - began_ns) * 1e-9
+            assert not any(event["event"] == "pwm" and event["duty"] > 0 for event in stand.board.trace)
+            return took_s
+
+    worst_s = max(side_by_side(len(attempts), attempt, AT_ONCE))
+    matrix_row(12, fault="a signal before arming", tries=len(attempts), limit="no valve opens, exit code of the signal",
+               worst=f"none; left after {worst_s:.2f} s", clock="host")  # fmt: skip
+
+
 # ---- Row 11: the host stands still
 
 
