@@ -17,10 +17,10 @@ from modsoft.runtime.errors import UsageError
 
 Array = NDArray[np.float64]
 
-# Of an error that stays the same, how much more is taken off in a period; and how much of it at once. Chosen on random
-# smooth references of four and of six modules, never on the tasks that are reported.
-INTEGRAL_GAIN = 0.5
-PROPORTIONAL_GAIN = 0.0
+# How much of an error that stays the same is taken off in each period. Chosen on random smooth references of four and of
+# six modules, never on the tasks that are reported: smallest error at 0.7 of 0.3, 0.5, 0.7, 0.9. A noisy tracker wants
+# less: at 0.5 degrees of noise the smallest error is at 0.3, and at 0.7 still well below the network's alone.
+GAIN = 0.7
 LARGEST_SHIFT = 0.4  # of the unit vector
 
 
@@ -48,16 +48,10 @@ class NoCorrection:
 
 
 class IntegralCorrection:
-    """Integral (and proportional) control of each module's configuration; made anew for every run."""
+    """Integral control of each module's configuration; made anew for every run."""
 
-    def __init__(
-        self,
-        modules: int,
-        integral: float = INTEGRAL_GAIN,
-        proportional: float = PROPORTIONAL_GAIN,
-        largest: float = LARGEST_SHIFT,
-    ):
-        self.integral, self.proportional, self.largest = integral, proportional, largest
+    def __init__(self, modules: int, gain: float = GAIN, largest: float = LARGEST_SHIFT):
+        self.gain, self.largest = gain, largest
         self.sum = np.zeros((modules, 3))
         self._held = np.zeros(modules, dtype=bool)  # modules whose last answer did not go out as it was
 
@@ -66,13 +60,13 @@ class IntegralCorrection:
         error = np.asarray(desired) - measured
         # Anti-windup at the unit sphere: what points out of it asks for nothing that a module can do, but would have
         # to be undone when the desired configuration turns.
-        summed = _across(self.sum + self.integral * error, ahead)
+        summed = _across(self.sum + self.gain * error, ahead)
         size = np.linalg.norm(summed, axis=-1, keepdims=True)
         summed *= np.minimum(1.0, self.largest / np.maximum(size, 1e-12))
         # Anti-windup at saturation: a module that cannot do more is asked for no more, but may be for less.
         grows = np.linalg.norm(summed, axis=-1) > np.linalg.norm(self.sum, axis=-1)
         self.sum = np.where((self._held & grows)[:, None], self.sum, summed)
-        shifted = ahead + self.sum + self.proportional * _across(error, ahead)
+        shifted = ahead + self.sum
         return shifted / np.linalg.norm(shifted, axis=-1, keepdims=True)
 
     def answered(self, raw: Array, applied: Array) -> None:
