@@ -135,7 +135,7 @@ def test_row_08_board_reset_in_mid_run(matrix_row, full):
             assert rises(emulated.trace, since) == 0
             return vented_ms(emulated, since, reset["t_us"]), noticed_ms, back_ms
 
-    tries = 50
+    tries = 50 if full else 20
     vented, noticed, back = worst(side_by_side(tries, attempt, AT_ONCE))
     matrix_row(8, fault="board reset in mid-run", tries=tries,
                limit="noticed in 1.2 s, outputs 0 in 130 ms, back in 6 s, no byte sent to it",
@@ -183,7 +183,7 @@ def test_row_28_firmware_hangs(matrix_row, full):
             assert rises(emulated.trace, since) == 0
             return vented_ms(emulated, since, hang["t_us"])
 
-    tries = 100 if full else 20
+    tries = 100 if full else 10
     vented = max(side_by_side(tries, attempt, AT_ONCE))
     matrix_row(28, fault="firmware hangs", tries=tries, limit="all 0 in 130 ms", worst=f"{vented:.1f} ms",
                clock="emulated")  # fmt: skip

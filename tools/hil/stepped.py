@@ -8,8 +8,7 @@ import serial
 
 from modsoft.hil.emulator import EmulatedBoard
 
-STEP_US = 1000
-STEPS_PER_READ = 5  # a read of the runtime's port waits 5 ms
+STEP_US = 5000  # a read of the runtime's port waits 5 ms
 HELD_AT_MOST = 2048  # by a pseudo-terminal that nobody reads; it has room for more
 ARRIVES_IN_S = 1.0  # in real time
 
@@ -17,7 +16,7 @@ ARRIVES_IN_S = 1.0  # in real time
 class SteppedPort:
     """What `modsoft.runtime.board.Board` uses of a port, for `threaded=False` and `clock=port.clock`.
 
-    A read without data lets 5 ms pass at most. What was written arrives in the next step, and what the board sent in a
+    A read without data lets 5 ms pass. What was written arrives in the next step, and what the board sent in a
     step can be read after it.
     """
 
@@ -42,9 +41,7 @@ class SteppedPort:
         return self._port.in_waiting
 
     def read(self, size: int = 1) -> bytes:
-        for _ in range(STEPS_PER_READ):
-            if self.in_waiting:
-                break
+        if not self.in_waiting:
             self._step(STEP_US)
         data = self._port.read(size)
         self._taken += len(data)
