@@ -55,7 +55,7 @@ STAGES = [
         ["modsoft-collect", "--robot", ROBOT, "--samples", "15000", "--strategy", "staged", "--out", str(DATA)],
         DATA,
         [f"runtime/robots/{ROBOT}.toml", "training/fleet*.[ch]", *SHARED]
-        + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "collect")]
+        + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "actions", "collect")]
         + [f"training/{name}.py" for name in ("dataset", "hdf5", "shards", "backends")],
     ),
     Stage(
@@ -63,7 +63,7 @@ STAGES = [
         ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--minutes", "3.5"],
         CHECKPOINT,
         [str(DATA), *SHARED]
-        + [f"training/{name}.py" for name in ("train", "dataset", "hdf5", "networks", "checkpoint")],
+        + [f"training/{name}.py" for name in ("train", "muon", "dataset", "hdf5", "networks", "checkpoint")],
     ),
     Stage(
         "export it and compare it with torch",
