@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mega_in_run import side_by_side
-from runtime_in_run import Run, Stand
+from runtime_in_run import Run, Stand, if_begun
 from virtual_loop import PERIOD_S, World
 
 from modsoft.runtime import log as logs
@@ -84,6 +84,7 @@ def test_row_25_disk_full_in_a_run(matrix_row, full, model_file, tmp_path):
     """The kernel refuses to make any file of the process longer, from some instant on."""
     phases_s = np.random.default_rng(25).uniform(0.0, 2.0, 20 if full else 3)
 
+    @if_begun
     def attempt(number):
         with Stand() as stand, Run(stand, model_file, tmp_path / str(number), "--steps", "15") as run:
             run.wait_for(lambda: run.ticks() >= 2)
@@ -187,6 +188,7 @@ def stepping(tmp_path_factory):
 def test_row_27_wall_clock_steps(matrix_row, full, model_file, tmp_path, stepping):
     tries, steps = 10 if full else 2, 25 if full else 15
 
+    @if_begun
     def attempt(number, again=2):
         """Every run but the first has a wall clock that steps."""
         folder, how = tmp_path / f"{number}-{again}", {"env": stepping} if number else {}

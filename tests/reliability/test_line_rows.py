@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from mega_in_run import side_by_side
-from runtime_in_run import Run, Stand
+from runtime_in_run import Run, Stand, if_begun
 
 pytestmark = pytest.mark.realtime
 
@@ -31,6 +31,7 @@ def test_rows_13_14_15_18_19_tracker_in_trouble_on_the_line(matrix_row, full, mo
     phases_s = np.random.default_rng(13).uniform(0.0, 0.4, 20 if full else 1)
     attempts = [(name, phase_s) for name in FAULTS for phase_s in phases_s]
 
+    @if_begun
     def attempt(number, again=2):
         (fault, _, code, word), phase_s = FAULTS[attempts[number][0]], attempts[number][1]
         with Stand() as stand, Run(stand, model_file, tmp_path / f"{number}-{again}") as run:

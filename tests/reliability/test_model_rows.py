@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mega_in_run import side_by_side
-from runtime_in_run import SCRIPT, Run, Stand
+from runtime_in_run import SCRIPT, Run, Stand, if_begun
 from spoilt_models import damaged, redescribed, running_wild
 from virtual_loop import World
 
@@ -136,9 +136,10 @@ def test_row_22_model_gives_nan_on_the_board(matrix_row, full, model_file, tmp_p
     """A model that passes every check, and goes wild in mid-run."""
     values = WILD * 5 if full else WILD[:4]
 
+    @if_begun
     def attempt(number):
         folder = Path(tmp_path / str(number))
-        folder.mkdir()
+        folder.mkdir(exist_ok=True)
         model = running_wild(model_file, folder / "model.onnx", values[number], beyond=0.2)
         with Stand() as stand, Run(stand, model, folder) as run:
             assert run.left()[0] == 65, run.said

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from mega_in_run import in_run, inject, side_by_side
-from runtime_in_run import FAULTY, SCRIPT, Run, Stand
+from runtime_in_run import FAULTY, SCRIPT, Run, Stand, if_begun
 
 from modsoft.hil.trace import rises, vented_us
 from modsoft.runtime.errors import LostInRun, Tripped
@@ -56,6 +56,7 @@ def test_row_12_every_way_out_vents(matrix_row, full, model_file, tmp_path):
     phases_s = (np.arange(tries) + np.random.default_rng(12).uniform(size=tries)) * 5.0 / tries  # 1.2 s of it arming
     attempts = [(name, phase_s) for name in CAUSES for phase_s in phases_s]
 
+    @if_begun
     def attempt(number):
         name, phase_s = attempts[number]
         cause, code, can_say = CAUSES[name]
@@ -97,6 +98,7 @@ def test_row_12_nobody_says_vented_for_a_board_that_is_not_heard(matrix_row, mod
     """The line from the board is cut just before: it vents as it should, but its word never comes."""
     names = ["SIGINT", "SIGTERM", "SIGHUP", "exception", "tracker lost", "board restarts"]
 
+    @if_begun
     def attempt(number):
         cause, code, _ = CAUSES[names[number]]
         program, folder = program_for(names[number]), tmp_path / str(number)
@@ -120,6 +122,7 @@ def test_row_12_a_signal_before_arming_opens_no_valve(matrix_row, full, model_fi
     phases_s = np.linspace(0.0, 1.0, 20 if full else 3)
     attempts = [(name, phase_s) for name in ("SIGINT", "SIGTERM", "SIGHUP") for phase_s in phases_s]
 
+    @if_begun
     def attempt(number):
         name, phase_s = attempts[number]
         cause, code, _ = CAUSES[name]
@@ -152,6 +155,7 @@ def test_row_11_host_stands_still(name, matrix_row, full, strong_model, tmp_path
     cause, limit_ms, codes = STAND_STILL[name]
     phases_s = np.random.default_rng(11).uniform(0.0, 0.4, 100 if full else 4)
 
+    @if_begun
     def attempt(number):
         with Stand() as stand, Run(stand, strong_model, tmp_path / str(number), program=FAULTY) as run:
             run.wait_for(lambda: run.ticks() >= 6)
