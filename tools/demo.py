@@ -55,8 +55,8 @@ STAGES = [
         ["modsoft-collect", "--robot", ROBOT, "--samples", "15000", "--strategy", "staged", "--out", str(DATA)],
         DATA,
         [f"runtime/robots/{ROBOT}.toml", "training/fleet*.[ch]", *SHARED]
-        + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "actions", "collect")]
-        + [f"training/{name}.py" for name in ("dataset", "hdf5", "shards", "backends")],
+        + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "collect")]
+        + [f"training/{name}.py" for name in ("actions", "dataset", "hdf5", "shards", "backends")],
     ),
     Stage(
         "train the biLSTM controller",
