@@ -42,8 +42,8 @@ def _count() -> tuple[Counts, dict[tuple[str, int, int], int]]:
     """How often each (file, line) and each (file, line, branch) was taken, over all libraries together."""
     lines: Counts = defaultdict(int)
     branches: dict[tuple[str, int, int], int] = defaultdict(int)
-    for counters in sorted(BUILD.glob("lib*.gcda")):
-        command = ["gcov", "--json-format", "--branch-probabilities", "--stdout", counters.name]
+    for counters in sorted(BUILD.rglob("*.gcda")):
+        command = ["gcov", "--json-format", "--branch-probabilities", "--stdout", str(counters)]
         done = subprocess.run(command, cwd=BUILD, capture_output=True, text=True, check=True)
         for file in json.loads(done.stdout)["files"]:
             name = Path(file["file"]).name

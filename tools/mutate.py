@@ -200,8 +200,9 @@ def main(every: int, source: str | None, only_list: bool) -> None:
     if only_list:
         print("\n".join(mutant.name for mutant in chosen))
         return
+    shutil.rmtree(BUILD, ignore_errors=True)
     for folder in COPIED:
-        shutil.copytree(ROOT / folder, BUILD / folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / folder, BUILD / folder, ignore=shutil.ignore_patterns("__pycache__"))
     os.environ["MODSOFT_NATIVE_FIRMWARE"] = str(BUILD / "built")
     plugin = Mutation(chosen, listed)
     options = ["-q", "-s", "--disable-warnings", "-p", "no:cacheprovider", "-p", "no:timeout"]
