@@ -3,12 +3,10 @@
 #include "harness.h"
 
 #include <errno.h>
-#include <fcntl.h>
 #include <getopt.h>
 #include <math.h>
 #include <poll.h>
 #include <signal.h>
-#include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -26,13 +24,8 @@
 #define SLICE_US 500
 #define LATE_US 1000            /* a slice later than this is counted */
 #define LATE_BOUND_US 20000     /* later than this, emulated time gives way instead of running after real time */
-#define EVENT_BACKLOG (64u << 20)
 #define STEP_WAIT_US 50 /* for the bytes that a pseudo terminal still holds */
 #define STEP_TRIES 20000
-
-static int events_fd;
-static char *pending;
-static size_t pending_size, pending_room;
 
 static uint64_t started_ns, slices, late_slices, max_late_ns, slipped_ns, pwm_events, resets;
 static double duty_now[MAX_CHANNELS];
@@ -45,74 +38,12 @@ static volatile sig_atomic_t stop_signal;
 static pid_t parent;
 static uint64_t random_state = 0x9E3779B97F4A7C15u;
 
-static uint64_t mono_ns(void)
-{
-    struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    return (uint64_t)now.tv_sec * 1000000000u + (uint64_t)now.tv_nsec;
-}
-
 uint32_t random_u32(void)
 {
     random_state ^= random_state << 13; /* xorshift64 */
     random_state ^= random_state >> 7;
     random_state ^= random_state << 17;
     return random_state >> 32;
-}
-
-void fail(int exit_code, const char *format, ...)
-{
-    va_list arguments;
-    va_start(arguments, format);
-    fprintf(stderr, "board: ");
-    vfprintf(stderr, format, arguments);
-    fputc('\n', stderr);
-    va_end(arguments);
-    exit(exit_code);
-}
-
-/* Events are kept and written without blocking: a slow reader must not hold up emulated time, and nothing is dropped. */
-static void flush_events(bool wait)
-{
-    size_t done = 0;
-    while (done < pending_size) {
-        ssize_t written = write(events_fd, pending + done, pending_size - done);
-        if (written > 0) {
-            done += (size_t)written;
-        } else if (errno == EAGAIN && wait) {
-            poll(&(struct pollfd){.fd = events_fd, .events = POLLOUT}, 1, 1000);
-        } else if (errno == EAGAIN) {
-            break;
-        } else if (errno != EINTR) {
-            exit(0); /* nobody is left to report to */
-        }
-    }
-    memmove(pending, pending + done, pending_size -= done);
-}
-
-void event(const char *name, const char *format, ...)
-{
-    char line[2048];
-    ticks_t now = board_now();
-    int size = snprintf(line, sizeof line, "{\"t_us\":%llu.%04u,\"mono_ns\":%llu,\"event\":\"%s\"",
-                        (unsigned long long)(now / TICKS_PER_US), (unsigned)(now % TICKS_PER_US) * (10000 / TICKS_PER_US),
-                        (unsigned long long)mono_ns(), name);
-    va_list arguments;
-    va_start(arguments, format);
-    int members = vsnprintf(line + size + 1, sizeof line - size - 4, format, arguments);
-    va_end(arguments);
-    if (members) {
-        line[size] = ',';
-        size += 1 + members;
-    }
-    line[size++] = '}';
-    line[size++] = '\n';
-    if (pending_size + size > EVENT_BACKLOG)
-        fail(EXIT_INTERNAL, "nobody reads the events: %zu bytes are waiting", pending_size);
-    if (pending_size + size > pending_room)
-        pending = realloc(pending, pending_room = 2 * pending_room + sizeof line);
-    memcpy(pending + pending_size, line, size);
-    pending_size += size;
 }
 
 void report_duty(unsigned channel, double duty, unsigned compare, unsigned top)
@@ -307,10 +238,7 @@ int main(int argc, char **argv)
     if (!options.port_link)
         fail(EXIT_USAGE, "--port-link PATH is missing: where to put the link to the serial port");
 
-    /* Libraries print on stdout; the events keep it for themselves. */
-    events_fd = fcntl(1, F_DUPFD_CLOEXEC, 3);
-    dup2(2, 1);
-    fcntl(events_fd, F_SETFL, fcntl(events_fd, F_GETFL) | O_NONBLOCK);
+    events_begin();
     signal(SIGPIPE, SIG_IGN);
     signal(SIGINT, on_signal);
     signal(SIGTERM, on_signal);

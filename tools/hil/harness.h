@@ -1,8 +1,8 @@
 /* What the two emulated boards share, and what each of them has to give.
  *
  * board.c (the compiled firmware on simavr) and native_board.c (the firmware's logic compiled for this machine) implement
- * the board_* functions; line.c (the serial line as a pseudo terminal) and harness.c (main, commands, events, pacing)
- * are the same for both. The commands and events are described at the top of board.c. */
+ * the board_* functions; line.c (the serial line as a pseudo terminal), events.c and harness.c (main, commands,
+ * pacing) are the same for both. The commands and events are described at the top of board.c. */
 #ifndef HARNESS_H
 #define HARNESS_H
 
@@ -76,13 +76,19 @@ void line_send(ticks_t end, uint8_t byte, uint32_t board_baud);
 bool line_command(const char *verb, double probability);
 void line_flood(ticks_t duration);
 
-/* --- events and random numbers (harness.c) ----------------------------------------------------------------------- */
+/* --- events (events.c) ------------------------------------------------------------------------------------------- */
 
+void events_begin(void);
+uint64_t mono_ns(void); /* CLOCK_MONOTONIC */
+void flush_events(bool wait);
 void event(const char *name, const char *format, ...) __attribute__((format(printf, 2, 3)));
+_Noreturn void fail(int exit_code, const char *format, ...) __attribute__((format(printf, 2, 3)));
+
+/* --- outputs and random numbers (harness.c) ---------------------------------------------------------------------- */
+
 void report_duty(unsigned channel, double duty, unsigned compare, unsigned top);
 void report_reset(const char *cause);
 uint32_t random_u32(void);
-_Noreturn void fail(int exit_code, const char *format, ...) __attribute__((format(printf, 2, 3)));
 
 enum { EXIT_USAGE = 2, EXIT_INTERNAL = 70 };
 
