@@ -27,7 +27,7 @@ from modsoft.runtime.files import check_writable
 @click.option("--iterations", default=6000, type=click.IntRange(1), help="Steps of the optimiser.")
 @click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Time that ends the run if it is first.")
 @click.option("--batch", type=click.IntRange(1), help="Windows in a step.  [default: 64 cable, 128 pneumatic]")
-@click.option("--rate", default=3e-3, type=click.FloatRange(min=0, min_open=True), help="Peak learning rate.")
+@click.option("--rate", default=3e-3, type=click.FloatRange(0, 1e6, min_open=True), help="Peak learning rate.")
 @click.option("--dropout", default=0.05, type=click.FloatRange(0, 1, max_open=True), help="Between the layers.")
 @click.option(
     "--shorter",
@@ -56,8 +56,9 @@ def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
     Stopped or killed, the same command goes on from OUT.resume and ends with the same model. At the end it prints
     how far off the estimated actuation is on data never used, in percent of the actuation range.
     """
-    if options["minutes"] is not None and not math.isfinite(options["minutes"]):
-        raise UsageError(f"--minutes {options['minutes']}: expected a number of minutes")
+    for name, value in options.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise UsageError(f"--{name} {value}: expected a finite number")
     check_writable(out)
     is_there = out.exists()
     # Before torch is loaded: by default its threads spin while they wait, and on a busy core that costs all speed.
@@ -73,7 +74,8 @@ def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
         suited = {**suited, "shorter": 0.0}
     settings = train.Settings(**{**suited, **told})
     began_s, first, smooth = time.monotonic(), None, 0.0
-    with tqdm(total=100, desc="train", bar_format="{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}") as bar:
+    shown = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
+    with tqdm(total=100, desc="train", bar_format=shown, disable=is_there) as bar:
 
         def progress(told: train.Progress) -> None:
             nonlocal first, smooth

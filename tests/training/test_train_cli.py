@@ -56,6 +56,9 @@ def test_killed_and_started_again_it_ends_with_the_same_model(folder):
     one, other = (checkpoints.load(folder / name)["weights"] for name in ("straight.pt", "m.pt"))
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert not resume.exists()
+    finished = run(folder, "d.h5", "--out", "m.pt", *QUICK)
+    assert "m.pt: there already, " in finished.stdout
+    assert finished.stderr == "", "nothing to wait for, so no bar"
 
 
 def test_the_network_asked_for_is_trained(folder):
@@ -75,6 +78,9 @@ def test_the_network_asked_for_is_trained(folder):
         (["d.h5", "--out", "none/m.pt"], 2, "no folder none"),
         (["d.h5", "--minutes", "0"], 2, "minutes"),
         (["d.h5", "--minutes", "nan"], 2, "minutes"),
+        (["d.h5", "--rate", "nan"], 2, "--rate nan"),
+        (["d.h5", "--rate", "1e300"], 2, "rate"),
+        (["d.h5", "--dropout", "nan"], 2, "--dropout nan"),
         (["d.h5", "--out", "."], 2, "."),
         (["d.h5", "--network", "module-lstm", "--shorter", "0.4"], 2, "bound to its number of modules"),
         ([], 2, "DATASET"),
