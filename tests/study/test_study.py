@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from modsoft.runtime.errors import ModelError
+from modsoft.runtime.errors import ModelError, OutputError
 from modsoft.study import figures, flights, floors, making, measure, plan
 from modsoft.study.cells import pick
 from modsoft.study.folder import Folder
@@ -164,6 +164,19 @@ def test_a_folder_without_results_is_told_what_makes_them(tmp_path, ended):
     code, _, error = ended("report", tmp_path)
     assert (code, len(error.splitlines())) == (ModelError.exit_code, 1)
     assert "modsoft-evaluate study" in error
+
+
+def test_the_short_form_and_the_whole_study_are_not_mixed_in_one_folder(study, ended):
+    code, _, error = ended("study", "--jobs", "1", "--only", "collect", "--out", study)
+    assert code == ModelError.exit_code
+    assert "asked for" in error.splitlines()[-1]
+    assert "Traceback" not in error
+
+
+def test_a_folder_that_cannot_be_made_is_told_in_one_line(tmp_path, ended):
+    (tmp_path / "file").write_text("")
+    code, _, error = ended("study", "--quick", "--out", tmp_path / "file/study")
+    assert (code, len(error.splitlines())) == (OutputError.exit_code, 1)
 
 
 def test_results_of_another_version_are_refused(made_study, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from modsoft.runtime.errors import OutputError
 from modsoft.study.plan import Model, Run
 
 
@@ -19,7 +20,10 @@ class Folder:
 
     def make(self) -> None:
         for name in ("data", "models", "estimates", "runs", "floors", "figures"):
-            (self.out / name).mkdir(parents=True, exist_ok=True)
+            try:
+                (self.out / name).mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise OutputError(f"{self.out / name}: no such folder can be made ({error.strerror})") from error
 
     def data(self, name: str) -> Path:
         return self.out / "data" / f"{name}.h5"
