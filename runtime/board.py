@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, Tripped
 from modsoft.runtime.fit import check_board
 from modsoft.runtime.link import HELLO_WAIT_S, RESETS, STATUS_SILENCE_S, Link, Phase, fault_names, refusal
-from modsoft.runtime.ports import READ_WAIT_S, open_port
+from modsoft.runtime.ports import READ_WAIT_S, may_be_mega, open_port
 from modsoft.runtime.protocol import (
     CHANNELS,
     PROTOCOL_HASH,
@@ -64,17 +64,23 @@ class Board:
     """A board that has announced itself and speaks this protocol. Use as a context manager: leaving vents and closes.
 
     port: an open serial port. name: for messages. clock: monotonic seconds. threaded: False drives the port from the
-    calls that wait instead of a thread of its own, for tests on virtual time.
+    calls that wait instead of a thread of its own, for tests on virtual time. resettable: False for a device that is
+    known to be no MEGA, and is not to be reset through DTR.
     Raises `DeviceAbsent` when nothing announces itself, `ProtocolMismatch` when it speaks another protocol.
     """
 
     def __init__(
-        self, port: Port, name: str = "port", clock: Callable[[], float] = time.monotonic, threaded: bool = True
+        self,
+        port: Port,
+        name: str = "port",
+        clock: Callable[[], float] = time.monotonic,
+        threaded: bool = True,
+        resettable: bool = True,
     ) -> None:
         self.name = name
         self._port = port
         self._clock = clock
-        self._link = Link(clock())
+        self._link = Link(clock(), resettable)
         self._dtr = True
         self._away = False  # closed for the time of a reset
         self._p_max = 0
@@ -98,7 +104,7 @@ class Board:
 
         Raises `DeviceAbsent`, `PortBusy` and `ProtocolMismatch`, each with what to do.
         """
-        return cls(open_port(name, baud), name)
+        return cls(open_port(name, baud), name, resettable=may_be_mega(name))
 
     # ---- what is known
 

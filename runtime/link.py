@@ -68,9 +68,12 @@ class _Request:
 
 
 class Link:
-    """One conversation with one board. Times are seconds of one monotonic clock, `now` never runs backwards."""
+    """One conversation with one board. Times are seconds of one monotonic clock, `now` never runs backwards.
 
-    def __init__(self, now: float) -> None:
+    resettable: False where the device is known not to be a MEGA, and is not to be reset.
+    """
+
+    def __init__(self, now: float, resettable: bool = True) -> None:
         self.phase = Phase.WAITING
         self.hello: Hello | None = None
         self.foreign_hash: int | None = None
@@ -92,6 +95,7 @@ class Link:
 
         self._parser = Parser()
         self._asked_at = self._opened_at = now
+        self._resettable = resettable
         self._late_bytes = 0  # that came when the firmware had to be running
         self._pulse_until: float | None = None
         self._heartbeat_due = now
@@ -278,11 +282,13 @@ class Link:
             # It never restarted when the port was opened (some adapters do not), so its HELLO is long gone.
             self._opened_at = now  # asked again after the same time
             return encode(HelloReq(PROTOCOL_HASH))
-        if self._late_bytes and self.status is None and now - self._asked_at >= STRANGER_AFTER_S:
-            self.gave_up = True  # a device is there and runs something else: no reset makes it ours
-            self._lose("what talks there does not speak this protocol", now)
+        # A device that runs something else is not made ours by a reset.
+        stranger = self.status is None and (self._late_bytes > 0 or not self._resettable)
+        if stranger and now - self._asked_at >= STRANGER_AFTER_S:
+            self.gave_up = True
+            self._lose("what is there does not speak this protocol", now)
         elif now - self._asked_at >= HELLO_WAIT_S:
-            if self.resets == RESETS:
+            if self.resets == RESETS or not self._resettable:
                 self.gave_up = True
                 self._lose("nothing announced itself", now)
             else:

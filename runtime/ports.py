@@ -14,6 +14,8 @@ from modsoft.runtime.errors import DeviceAbsent, PortBusy, UsageError
 
 # Arduino MEGA 2560: Arduino's own identities, and the older and the Italian maker's numbers.
 MEGA_IDENTITIES = {(0x2341, 0x0042), (0x2341, 0x0010), (0x2341, 0x0242), (0x2A03, 0x0042), (0x2A03, 0x0010)}
+# Makers of what boards compatible with it have in the place of Arduino's USB chip: WCH, Silicon Labs, FTDI, Prolific.
+COMPATIBLE_VENDORS = {vid for vid, _ in MEGA_IDENTITIES} | {0x1A86, 0x10C4, 0x0403, 0x067B}
 BY_ID = Path("/dev/serial/by-id")
 READ_WAIT_S = 0.005  # how long the I/O thread sleeps in a read; bounds how late it writes
 # The board's own link time-out. pyserial also counts the time for which this process was held up by others, and a
@@ -96,6 +98,14 @@ def find_port(told: str) -> str:
             f"--port {number} (its serial number) finds under any name"
         )
     raise DeviceAbsent(f"no board at {told}: no such port; {ports_here()}")
+
+
+def may_be_mega(name: str) -> bool:
+    """Whether a MEGA, or a board compatible with it, may be at this port; False only where the operating system knows
+    of a device of another maker there, or of a port without USB."""
+    device = os.path.realpath(name)
+    vendors = [port.vid for port in list_ports() if os.path.realpath(port.device) == device]
+    return not vendors or vendors[0] in COMPATIBLE_VENDORS
 
 
 def open_port(name: str, baud: int) -> serial.Serial:

@@ -253,6 +253,18 @@ def test_missing_port_names_the_mega_that_is_elsewhere_and_how_to_find_it(monkey
         ports.find_port("/dev/ttyACM0")
 
 
+@pytest.mark.parametrize(
+    ("vid", "may"), [(0x2341, True), (0x1A86, True), (0x0403, True), (0x0B95, False), (None, False)]
+)
+def test_only_what_may_be_a_mega_is_reset(monkeypatch, tmp_path, vid, may):
+    (tmp_path / "ttyACM0").touch()
+    (tmp_path / "by-name").symlink_to(tmp_path / "ttyACM0")
+    there = mega(str(tmp_path / "ttyACM0"), "75A")._replace(vid=vid)
+    monkeypatch.setattr(ports, "list_ports", lambda: [there])
+    assert ports.may_be_mega(str(tmp_path / "by-name")) is may
+    assert ports.may_be_mega(str(tmp_path / "ttyACM1")), "nothing is known of it"
+
+
 def test_a_serial_number_that_two_boards_have_is_no_identity(monkeypatch):
     monkeypatch.setattr(ports, "list_ports", lambda: [mega("/dev/ttyACM0", "0001"), mega("/dev/ttyACM1", "0001")])
     with pytest.raises(UsageError, match="give one of /dev/ttyACM0, /dev/ttyACM1"):

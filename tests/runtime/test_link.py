@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from modsoft.runtime.link import HEARTBEAT_S, Link, Phase
-from modsoft.runtime.protocol import CHANNELS, PROTOCOL_HASH, Hello, Set, State, Status, encode
+from modsoft.runtime.protocol import CHANNELS, PROTOCOL_HASH, Hello, HelloReq, Set, State, Status, encode
 
 HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 30000, 20000, 300, 1000)
 ZERO = (0,) * CHANNELS
@@ -97,3 +97,16 @@ def test_a_board_that_was_running_is_ours_whatever_else_came():
     link.feed(encode(IDLE), 1.7)
     link.poll(2.5)
     assert link.phase is Phase.WAITING
+
+
+def test_a_device_that_is_no_mega_is_never_reset():
+    link = Link(0.0, resettable=False)
+    assert link.poll(2.4) == b""
+    assert link.phase is Phase.WAITING
+    link.poll(2.5)
+    assert (link.phase, link.gave_up, link.resets, link.dtr) == (Phase.LOST, True, 0, True)
+    talking = Link(0.0, resettable=False)
+    talking.feed(encode(IDLE), 2.4)
+    assert talking.poll(2.5) == encode(HelloReq(PROTOCOL_HASH))
+    talking.poll(3.0)
+    assert (talking.phase, talking.resets) == (Phase.LOST, 0)
