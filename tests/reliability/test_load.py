@@ -85,7 +85,7 @@ def test_row_26_one_core_with_four_busy_processes(matrix_row, full, strong_model
 HALTS_S = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6)
 SURELY_OUTLASTED_S = LINK_TIMEOUT_S - HEARTBEAT_S - 0.05
 SURELY_TOO_LONG_S = LINK_TIMEOUT_S + 0.05
-AT_ONCE = 4
+AT_ONCE = 2
 
 
 def halted(stand, run, halt_s, phase_s):
