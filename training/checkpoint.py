@@ -18,6 +18,7 @@ from __future__ import annotations
 import pickle
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -72,12 +73,12 @@ def _check_archive(path: Path) -> None:
         if damaged := archive.testzip():
             raise ModelError(f"{path}: damaged: {damaged} in it fails its checksum; copy or train it again")
     names = [entry.filename for entry in entries]
-    folder = names[0].partition("/")[0] if names else ""
+    folder, times = names[0].partition("/")[0] if names else "", Counter(names)
     for entry, name in zip(entries, names, strict=True):
         inside = name.removeprefix(f"{folder}/")
         is_within = folder not in ("", "..") and inside != name and not {"..", ""} & set(inside.split("/"))
         is_plain = entry.compress_type == zipfile.ZIP_STORED and name == entry.orig_filename and "\\" not in name
-        if not (is_within and is_plain) or names.count(name) > 1 or inside == "constants.pkl":
+        if not (is_within and is_plain) or times[name] > 1 or inside == "constants.pkl":
             raise ModelError(f"{path}: not a checkpoint of modsoft-train (an archive with the entry {name!r})")
 
 
