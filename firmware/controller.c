@@ -274,8 +274,8 @@ static uint8_t check_control(struct controller *c, uint32_t now_ms) {
   return CHECK_CONTROL;
 }
 
-/* Counts how long something has been the case; true when it has been for limit_ms. Counts anew after a minute, when what
- * it found has long been latched. */
+/* Counts how long something has been the case; true when it has been for limit_ms. Counts anew after a minute, when
+ * what it found has long been latched. */
 static bool lasts(uint16_t *counted_ms, bool is, uint32_t elapsed_ms, uint16_t limit_ms) {
   uint32_t lasted_ms = is ? *counted_ms + elapsed_ms : 0;
   *counted_ms = (uint16_t)lasted_ms;

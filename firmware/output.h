@@ -16,8 +16,8 @@ struct output_stage {
   uint16_t remainder;                 /* part of a slew step not yet spent, 10 Pa / 1000 */
 };
 
-/* Moves every channel towards its target, clamped to 0 .. P_MAX, by no more than the slew limit allows in elapsed_ms. Channels
- * from CHANNELS_USED on stay at 0. */
+/* Moves every channel towards its target, clamped to 0 .. P_MAX, by no more than the slew limit allows in elapsed_ms.
+ * Channels from CHANNELS_USED on stay at 0. */
 void output_step(struct output_stage *stage, const int16_t targets[PROTOCOL_CHANNELS], uint32_t elapsed_ms);
 
 /* All channels to 0 at once. */

@@ -18,6 +18,7 @@
 #define SUPPLY (INPUTS + 1)
 #define ROUNDS_PER_SUPPLY 64
 #define REFERENCE_MV 1100UL
+#define LEAST_READING 18 /* of the reference; less would be a supply of more than 62 V */
 
 static bool has_sensor(uint8_t input) { return (SENSORS >> input) & 1; }
 
@@ -59,9 +60,10 @@ void sensors_poll(struct sensors *sensors) {
   }
   reading = ADC;
   if (sensors->input < INPUTS) {
-    sensors->measured[sensors->input] = (int16_t)((reading * (uint32_t)SENSOR_FULL + 512) >> 10);
+    const uint32_t half = 1UL << 9;
+    sensors->measured[sensors->input] = (int16_t)((reading * (uint32_t)SENSOR_FULL + half) >> 10);
   } else if (sensors->input == SUPPLY) {
-    sensors->supply_mv = reading > 0 ? (uint16_t)(REFERENCE_MV * 1024 / reading) : 0;
+    sensors->supply_mv = reading < LEAST_READING ? 0 : (uint16_t)(REFERENCE_MV * 1024 / reading);
   }
   next(sensors);
   start(sensors->input);

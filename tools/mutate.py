@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import shutil
-import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,13 +24,12 @@ import click
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-BUILD = ROOT / "build" / "mutation"
 EQUIVALENT = Path(__file__).with_name("mutate_equivalent.txt")
 COPIED = ("firmware", "tests/firmware", "tools/fuzz")
 SOURCES = ("output.c", "limits.h", "controller.c", "frame.c", "sensors.c", "boot.c", "pwm.c")
 TESTS = ("test_output.py", "test_controller.py", "test_frame.py", "test_chip.py")
 INSTRUMENT = "INSTRUMENT=-O0 -g0 -fsanitize=undefined -fno-sanitize-recover"
-HANGS_AFTER_S = 30  # a whole run of the tests takes 5
+HANGS_AFTER_S = 10  # of processor time; a whole run of the tests takes 4
 
 # What each token may become.
 OPERATORS = {
@@ -114,16 +114,16 @@ def equivalents() -> dict[str, str]:
     return listed
 
 
-def _build(mutant: Mutant | None, originals: dict[str, str]) -> bool:
+def _build(folder: Path, mutant: Mutant | None, originals: dict[str, str]) -> bool:
     """Put the mutant in place and compile; False where it does not."""
     for source, text in originals.items():
         if mutant is not None and source == mutant.source:
             lines = text.splitlines()
             lines[mutant.line] = mutant.after
             text = "\n".join(lines) + "\n"
-        if (copy := BUILD / "firmware" / source).read_text() != text:
+        if (copy := folder / "firmware" / source).read_text() != text:
             copy.write_text(text)
-    command = ["make", "-s", "-C", str(BUILD / "firmware"), "libraries", f"OUT={BUILD / 'built'}", INSTRUMENT]
+    command = ["make", "-s", "-C", str(folder / "firmware"), "libraries", f"OUT={folder / 'built'}", INSTRUMENT]
     command.append("WARNINGS=-w")  # a mutant may well have a variable that nothing uses
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
@@ -131,7 +131,8 @@ def _build(mutant: Mutant | None, originals: dict[str, str]) -> bool:
 class Mutation:
     """A pytest plugin: runs the collected tests once for each mutant, in a fork that ends with the first failure."""
 
-    def __init__(self, chosen: list[Mutant], listed: dict[str, str]) -> None:
+    def __init__(self, folder: Path, chosen: list[Mutant], listed: dict[str, str]) -> None:
+        self.folder = folder
         self.chosen = chosen
         self.listed = listed
         self.survivors: list[Mutant] = []
@@ -141,11 +142,11 @@ class Mutation:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         items = list(session.items)
         originals = {source: (ROOT / "firmware" / source).read_text() for source in SOURCES}
-        assert _build(None, originals), "the firmware does not compile"
+        assert _build(self.folder, None, originals), "the firmware does not compile"
         assert self._noticed_by(items) is None, "the tests fail on the firmware as it is"
         started = time.monotonic()
         for number, mutant in enumerate(self.chosen):
-            if not _build(mutant, originals):
+            if not _build(self.folder, mutant, originals):
                 self.uncompiled += 1
                 continue
             noticed = self._noticed_by(items)
@@ -166,7 +167,7 @@ class Mutation:
         reading, writing = os.pipe()
         child = os.fork()
         if child == 0:
-            signal.alarm(HANGS_AFTER_S)
+            resource.setrlimit(resource.RLIMIT_CPU, (HANGS_AFTER_S, HANGS_AFTER_S))
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, 1)
             os.dup2(null, 2)
@@ -186,6 +187,21 @@ class Mutation:
         return int(answer or "0") if status else None
 
 
+def _try_all(folder: Path, chosen: list[Mutant], listed: dict[str, str]) -> Mutation:
+    """In a copy of all that is compiled."""
+    for part in COPIED:
+        shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
+    os.environ["MODSOFT_NATIVE_FIRMWARE"] = str(folder / "built")
+    mutation = Mutation(folder, chosen, listed)
+    options = ["-q", "-s", "--disable-warnings", "--tb=native"]  # quick to write, and nobody reads it
+    options += [word for plugin in ("cacheprovider", "timeout", "faulthandler") for word in ("-p", f"no:{plugin}")]
+    options += ["-k", "not damaged_and_repeated and not arbitrary"]  # long, and no sharper than the others
+    code = pytest.main([*options, *(str(ROOT / "tests" / "firmware" / name) for name in TESTS)], plugins=[mutation])
+    if code != 0:
+        sys.exit(f"mutate: pytest ended with {code}")
+    return mutation
+
+
 @click.command(help=__doc__)
 @click.option("--every", default=1, show_default=True, help="Try only every n-th mutant.")
 @click.option("--source", type=click.Choice(SOURCES), help="Of this file alone.")
@@ -200,26 +216,18 @@ def main(every: int, source: str | None, only_list: bool) -> None:
     if only_list:
         print("\n".join(mutant.name for mutant in chosen))
         return
-    shutil.rmtree(BUILD, ignore_errors=True)
-    for folder in COPIED:
-        shutil.copytree(ROOT / folder, BUILD / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    os.environ["MODSOFT_NATIVE_FIRMWARE"] = str(BUILD / "built")
-    plugin = Mutation(chosen, listed)
-    options = ["-q", "-s", "--disable-warnings", "-p", "no:cacheprovider", "-p", "no:timeout"]
-    options += ["-k", "not damaged_and_repeated and not arbitrary"]  # long, and no sharper than the others
     started = time.monotonic()
-    code = pytest.main([*options, *(str(ROOT / "tests" / "firmware" / name) for name in TESTS)], plugins=[plugin])
-    if code != 0:
-        sys.exit(f"mutate: pytest ended with {code}")
-    tried = len(chosen) - plugin.uncompiled
-    spared = sum(mutant.name in listed for mutant in chosen) - len(plugin.noticed_though_listed)
+    with tempfile.TemporaryDirectory(prefix="modsoft-mutation-") as folder:
+        mutation = _try_all(Path(folder), chosen, listed)
+    tried = len(chosen) - mutation.uncompiled
+    spared = sum(mutant.name in listed for mutant in chosen) - len(mutation.noticed_though_listed)
     print(
-        f"{tried} mutants in {time.monotonic() - started:.0f} s ({plugin.uncompiled} more do not compile): "
-        f"{tried - spared - len(plugin.survivors)} noticed, {spared} equivalent, {len(plugin.survivors)} survive"
+        f"{tried} mutants in {time.monotonic() - started:.0f} s ({mutation.uncompiled} more do not compile): "
+        f"{tried - spared - len(mutation.survivors)} noticed, {spared} equivalent, {len(mutation.survivors)} survive"
     )
-    for mutant in plugin.noticed_though_listed:
+    for mutant in mutation.noticed_though_listed:
         print(f"listed as equivalent, but a test notices it: {mutant.name}")
-    sys.exit(1 if plugin.survivors or plugin.noticed_though_listed else 0)
+    sys.exit(1 if mutation.survivors or mutation.noticed_though_listed else 0)
 
 
 if __name__ == "__main__":

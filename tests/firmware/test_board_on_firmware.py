@@ -142,7 +142,7 @@ def run(board, port, seconds, pressures=HALF, first_tick=1, hz=2.5):
         board.set_pressures(tick, pressures)
         until = port.clock() + 1 / hz
         while port.clock() < until:
-            board._pump()
+            board._line.pump()
     return first_tick + round(seconds * hz)
 
 
@@ -180,7 +180,7 @@ def test_nothing_is_sent_before_hello(port):
 
 def run_pumps(board, times):
     for _ in range(times):
-        board._pump()
+        board._line.pump()
 
 
 def test_silent_port_is_reset_three_times_then_given_up(new_board):
@@ -353,7 +353,7 @@ def test_stuck_control_loop_is_noticed_by_the_board(rig):
     run(board, port, 2)
     stuck_at = port.now_ms
     while any(port.board.counts):
-        board._pump()  # the I/O thread lives on
+        board._line.pump()  # the I/O thread lives on
     assert port.now_ms - stuck_at <= 1400
     assert port.board.faults == Fault.CONTROL_TIMEOUT
     run_pumps(board, 40)
@@ -378,7 +378,7 @@ def test_cable_pulled(rig):
     board.arm(ROBOT)
     tick = run(board, port, 2)
     port.unplugged = True
-    board._pump()
+    board._line.pump()
     with pytest.raises(LostInRun, match="the port failed"):
         board.set_pressures(tick, HALF)
     assert board.vent() is False
@@ -424,7 +424,7 @@ def test_mute_board_is_lost(rig):
     port.mute = True
     muted_at = port.now_ms
     while board.lost is None:
-        board._pump()
+        board._line.pump()
     assert "no word from the board" in board.lost
     assert port.now_ms - muted_at <= 460
     assert board.vent() is False  # it did vent, but it could not say so
@@ -441,7 +441,7 @@ def test_board_reset_in_mid_run(rig):
     port.reset()
     reset_at = port.now_ms
     while board.lost is None:
-        board._pump()
+        board._line.pump()
     assert port.now_ms - reset_at <= 1200
     with pytest.raises(LostInRun):
         board.set_pressures(99, HALF)

@@ -16,7 +16,7 @@ from modsoft.runtime.protocol import CHANNELS, NOT_MEASURED, ResetCause
 FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
 TIMERS = {1: 0x80, 3: 0x90, 4: 0xA0, 5: 0x120}  # TCCRnA; TCCRnB, TCNTn, ICRn and OCRnA to C follow
 PORTS = {"B": 0x25, "E": 0x2E, "H": 0x102, "L": 0x10B}  # PORTx, DDRx before it
-ADCL, ADCSRA, ADMUX, DIDR0, MCUSR = 0x78, 0x7A, 0x7C, 0x7E, 0x54
+ADCL, ADCSRA, ADCSRB, ADMUX, DIDR0, MCUSR = 0x78, 0x7A, 0x7B, 0x7C, 0x7E, 0x54
 CONVERTING = 1 << 6
 TOP = 4095
 
@@ -71,11 +71,14 @@ def outputs():
 def test_pins_are_low_before_they_become_outputs_and_nothing_is_connected(chip, outputs):
     for port in PORTS.values():
         chip.registers[port] = 0xFF
+    for timer in TIMERS.values():  # as the Arduino core left them
+        chip.registers[timer : timer + 14] = [0xA5] * 14
     chip.code.pwm_begin()
     for timer in TIMERS.values():
         assert chip.registers[timer] == 0b10  # nothing connected; mode 14, fast PWM up to ICRn, over both registers
         assert chip.registers[timer + 1] == 0b11001  # no prescaler
         assert chip.word(timer + 6) == TOP
+        assert chip.word(timer + 4) == 0  # all begin together
     for channel, (_, _, port, bit) in enumerate(outputs):
         used = channel < 11
         assert chip.registers[port] >> bit & 1 == (not used)
@@ -118,6 +121,8 @@ def convert(chip, sensors, reading):
 
 def begin(chip):
     sensors = Sensors()
+    ctypes.memset(ctypes.byref(sensors), 0xA5, ctypes.sizeof(sensors))
+    chip.registers[ADCSRB] = 0xFF
     chip.code.sensors_begin(ctypes.byref(sensors))
     return sensors
 
@@ -131,6 +136,7 @@ def test_nothing_is_measured_before_its_first_reading(chip):
     assert sensors.supply_mv == 0
     assert chip.registers[DIDR0] == 0x3F
     assert chip.registers[ADCSRA] == 0b1_1_000_111  # on, started, 125 kHz
+    assert chip.registers[ADCSRB] == 0  # inputs 0 to 7
 
 
 def test_a_conversion_is_never_waited_for(chip):
@@ -142,9 +148,9 @@ def test_a_conversion_is_never_waited_for(chip):
 
 def test_supply_first_then_64_rounds_of_all_sensors(chip):
     sensors = begin(chip)
-    sources = [convert(chip, sensors, 225) for _ in range(2 + 64 * 6 + 2 + 6)]
+    sources = [convert(chip, sensors, 225) for _ in range(2 * (2 + 64 * 6))]
     rounds = [0b01_0_00000 | channel for channel in range(6)]
-    assert sources == [REFERENCE] * 2 + rounds * 64 + [REFERENCE] * 2 + rounds
+    assert sources == ([REFERENCE] * 2 + rounds * 64) * 2
     assert chip.registers[ADCSRA] & CONVERTING
 
 
@@ -154,19 +160,20 @@ def test_supply_voltage(chip):
     assert sensors.supply_mv == 0  # the first one is not settled
     convert(chip, sensors, 225)
     assert sensors.supply_mv == 1100 * 1024 // 225
-    for _ in range(64 * 6 + 1):
-        convert(chip, sensors, 225)
-    convert(chip, sensors, 0)
-    assert sensors.supply_mv == 0
+    for reading, supply_mv in ((17, 0), (18, 62577), (0, 0)):  # 16 bits hold no more
+        for _ in range(64 * 6 + 1):
+            convert(chip, sensors, 225)
+        convert(chip, sensors, reading)
+        assert sensors.supply_mv == supply_mv
 
 
 def test_pressures(chip):
     sensors = begin(chip)
     for _ in range(2):
         convert(chip, sensors, 225)
-    for reading in (0, 1, 102, 512, 1022, 1023):
+    for reading in (0, 1, 32, 512, 1022, 1023):
         convert(chip, sensors, reading)
-    assert list(sensors.measured) == [0, 10, 996, 5000, 9980, 9990] + [NOT_MEASURED] * 6
+    assert list(sensors.measured) == [0, 10, 313, 5000, 9980, 9990] + [NOT_MEASURED] * 6  # 312.5: half is rounded up
 
 
 def test_without_sensors_the_supply_is_measured_all_the_time(native, tmp_path):

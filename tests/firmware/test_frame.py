@@ -36,6 +36,15 @@ def test_longest_frame(board, length, accepted):
     assert isinstance(board.tell(protocol.HelloReq(protocol.PROTOCOL_HASH))[0], protocol.Hello)
 
 
+@pytest.mark.parametrize("length", [0, 1, 2])
+def test_shorter_than_a_header_is_no_frame_though_its_crc_is_right(board, length):
+    body = bytes(length)
+    board.messages()
+    board.feed(b"\0" + cobs.cobs_encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0")
+    assert board.messages() == []
+    assert board.library.board_rx_bad(board.handle) == 1
+
+
 def test_endless_frame_does_no_harm(board):
     board.messages()
     board.feed(b"\xff" * 10_000 + b"\0")
@@ -45,7 +54,7 @@ def test_endless_frame_does_no_harm(board):
 
 
 def test_crc_is_zlibs(sanitised):
-    for data in (b"", b"123456789", bytes(range(96))):
+    for data in (b"", b"123456789", *(bytes((start + n * n) % 256 for n in range(255)) for start in range(64))):
         assert sanitised.frame_crc32(data, len(data)) == zlib.crc32(data)
 
 

@@ -10,7 +10,7 @@
  *
  * Each try sends a running board one such frame and then a good SET, with new set-points. Prints one JSON object:
  *   tries, whole (arrived as they were sent: only a delimiter was hit), wrong (anything else taken for a frame, or a
- *   repeated one applied), lost (good SETs that were not applied), silences, latest_vent_ms (after the last good frame).
+ *   repeated one applied), lost (good SETs not applied), silences, latest_vent_ms (after the last good frame).
  * Ends with 1 where wrong or lost is not 0; aborts where a rule of watched.h is broken. */
 #include <stdio.h>
 #include <stdlib.h>

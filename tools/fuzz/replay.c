@@ -1,4 +1,4 @@
-/* Runs the fuzzer's target on files, without a fuzzer: replay FILE... . For the tests, and for looking into a finding. */
+/* Runs the fuzzer's target on files, without a fuzzer: replay FILE... . For the tests, and to look into a finding. */
 #include <stdint.h>
 #include <stdio.h>
 

@@ -1,9 +1,9 @@
-/* One input of the fuzzer: a life of the board, written as steps. Every step goes through watched.h, which aborts where a
- * rule is broken; so does, here, a frame from the board that is no good frame.
+/* One input of the fuzzer: a life of the board, written as steps. Every step goes through watched.h, which aborts where
+ * a rule is broken; so does, here, a frame from the board that is no good frame.
  *
  * A step begins with a byte: its low three bits say what, the others how much or which.
  *   0  so many raw bytes arrive
- *   1  a frame arrives: flags, then its payload (repaired where the flags say so, since no fuzzer guesses a CRC or a hash)
+ *   1  a frame arrives: flags, then its payload (repaired where the flags say so: no fuzzer guesses a hash)
  *   2  a stall of the loop: one byte, in ms
  *   3  so many passes of 1 ms, sensors following the outputs
  *   4  a sensor reads: two bytes
@@ -44,7 +44,8 @@ static void repair(const struct controller *board, uint8_t type, uint8_t *payloa
     case MESSAGE_SET:
       set->tick = board->set_tick + (set->tick & 3);
       for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
-        set->pressures[channel] = board->channels >> channel & 1 ? (int16_t)((uint16_t)set->pressures[channel] % (P_MAX + 1)) : 0;
+        uint16_t pressure = (uint16_t)set->pressures[channel] % (P_MAX + 1);
+        set->pressures[channel] = board->channels >> channel & 1 ? (int16_t)pressure : 0;
       }
       break;
     case MESSAGE_HEARTBEAT:

@@ -47,7 +47,7 @@ void watched_pass(struct watched *w, uint32_t elapsed_ms) {
   must(w, controller_update(board, w->measured, 5000, w->now_ms) == CHECK_ALL, "a pass left a check out");
 
   bool running = board->state == STATE_RUNNING;
-  must(w, (board->state == STATE_FAULT) == (board->faults != 0), "a fault is not latched, or nothing is wrong in FAULT");
+  must(w, (board->state == STATE_FAULT) == (board->faults != 0), "a fault is not latched, or none in FAULT");
   must(w, !(board->faults & FAULT_OVER_PRESSURE) || output_is_vented(&board->output), "over-pressure, and not dumped");
   if (running || board->state == STATE_ARMED) {
     must(w, w->now_ms - board->last_valid_ms <= LINK_TIMEOUT_MS, "in a session without a host");

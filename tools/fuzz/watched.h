@@ -1,5 +1,5 @@
-/* The firmware's logic under watch: every byte and every pass goes through here, and what must hold of any board, whatever
- * comes over the wire, is asserted after each. The rules are written anew, not taken from the firmware. */
+/* The firmware's logic under watch: every byte and every pass goes through here, and what must hold of any board,
+ * whatever comes over the wire, is asserted after each. The rules are written anew, not taken from the firmware. */
 #ifndef WATCHED_H
 #define WATCHED_H
 
@@ -22,9 +22,9 @@ void watched_begin(struct watched *w, uint32_t now_ms);
 /* One byte arrives. Returns true where it ended a good frame. */
 bool watched_receive(struct watched *w, uint8_t byte);
 
-/* Time passes, then one pass of the firmware's loop. Aborts, with one line, where a rule is broken: a byte since the last
- * pass moved an output, but to 0; an output leaves 0 .. P_MAX, moves faster than SLEW, or does not fall at SLEW outside
- * RUNNING or outside the session's channels; a fault is not latched; a session goes on past a time-out. */
+/* Time passes, then one pass of the firmware's loop. Aborts, with one line, where a rule is broken: a byte since the
+ * last pass moved an output, but to 0; an output leaves 0 .. P_MAX, moves faster than SLEW, or does not fall at SLEW
+ * outside RUNNING or outside the session's channels; a fault is not latched; a session goes on past a time-out. */
 void watched_pass(struct watched *w, uint32_t elapsed_ms);
 
 /* Sensors read what is applied now, or 0. */
