@@ -1,24 +1,19 @@
-"""The board at the other end of the serial port: an I/O thread around `Link`, and calls that wait for an answer.
-
-The thread owns the port. It sends the heartbeats, but with the control loop's own counter in them, so that the board
-also notices a loop that is stuck while this thread lives.
-"""
+"""The board at the other end of the serial port: what it says of itself, and calls that wait for its answer."""
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, Tripped
 from modsoft.runtime.fit import check_board
+from modsoft.runtime.line import Line
 from modsoft.runtime.link import HELLO_WAIT_S, RESETS, STATUS_SILENCE_S, Link, Phase, fault_names, refusal
-from modsoft.runtime.ports import READ_WAIT_S, may_be_mega, open_port
+from modsoft.runtime.ports import Port, may_be_mega, open_port
 from modsoft.runtime.protocol import (
     CHANNELS,
     PROTOCOL_HASH,
@@ -43,21 +38,6 @@ LOST_VENT_WAIT_S = 6.0  # a board in its bootloader needs up to 5 s of silence t
 CLEAR_WAIT_S = 1.0
 DOWN_BAR = 0.05  # P_DOWN of firmware/limits.h: above it a chamber is not empty
 DOWN_WAIT_S = 1.0  # for the air to leave, after the valves are at 0
-HAND_OVER_S = 0.002  # ten times what it takes
-
-
-class Port(Protocol):
-    """What is used of a pyserial port. `read` waits a few milliseconds at most."""
-
-    dtr: bool
-
-    @property
-    def in_waiting(self) -> int: ...
-    def read(self, size: int = 1) -> bytes: ...
-    def cancel_read(self) -> None: ...
-    def write(self, data: bytes) -> int | None: ...
-    def open(self) -> None: ...
-    def close(self) -> None: ...
 
 
 class Board:
@@ -78,24 +58,15 @@ class Board:
         resettable: bool = True,
     ) -> None:
         self.name = name
-        self._port = port
         self._clock = clock
         self._link = Link(clock(), resettable)
-        self._dtr = True
-        self._away = False  # closed for the time of a reset
+        self._line = Line(port, self._link, clock, threaded)
         self._p_max = 0
         self._listened = False
-        self._changed = threading.Condition()  # guards the link
-        self._stop = threading.Event()
-        self._written = threading.Event()
-        self._thread: threading.Thread | None = None
-        if threaded:
-            self._thread = threading.Thread(target=self._serve, name="board", daemon=True)
-            self._thread.start()
         try:
             self._await_hello()
         except BaseException:
-            self._shut()
+            self._line.close()
             raise
 
     @classmethod
@@ -154,7 +125,7 @@ class Board:
     @property
     def statistics(self) -> dict[str, int]:
         """Counts since the opening: bytes, bad_frames, refused, sets, missed_acks."""
-        with self._changed:
+        with self._line.changed:
             return dict(self._link.counts)
 
     def check(self) -> None:
@@ -179,15 +150,15 @@ class Board:
         """
         channels = check_board(self.hello, robot, self.name)
         deadline = self._clock() + ARM_WAIT_S
-        self._wait(lambda: self._link.status is not None, deadline)
+        self._line.wait(lambda: self._link.status is not None, deadline)
         if self.status is not None and self.status.faults and not self.status.faults & ~GONE_HOST:
             self.clear_fault()
         while True:
-            self._wait(lambda: self._link.can_arm, deadline)
+            self._line.wait(lambda: self._link.can_arm, deadline)
             self.check()
-            with self._changed:
+            with self._line.changed:
                 self._link.arm(channels, self.hello.p_full)
-            self._wait(lambda: not self._link.busy, deadline)
+            self._line.wait(lambda: not self._link.busy, deadline)
             self.check()
             status = self.status
             if status is not None and status.state == State.ARMED and self._link.armed:
@@ -199,13 +170,11 @@ class Board:
             if self._clock() >= deadline:
                 state = State(status.state).name if status is not None and status.state in set(State) else "unknown"
                 raise Tripped(f"board at {self.name} did not arm within {ARM_WAIT_S:.0f} s, its state is {state}")
-            self._wait(lambda: False, self._clock() + ARM_AGAIN_S)
+            self._line.wait(lambda: False, self._clock() + ARM_AGAIN_S)
 
     def set_pressures(self, tick: int, pressures_bar: ArrayLike) -> int:
-        """Hand over the set-points (channels,), bar, of this tick; returns their sequence number.
+        """Have the set-points (channels,), bar, of this tick written, 2 ms at most; returns their sequence number.
 
-        That is when they are written, or 2 ms later: the thread of the port needs the interpreter, so the caller steps
-        aside for it, but a port that takes nothing holds nobody up.
         A shorter row is filled up with 0 (vented). Raises `Tripped` for a value that is no pressure of this robot, and
         what `check` raises.
         """
@@ -219,17 +188,11 @@ class Board:
         if np.any(units < 0) or np.any(units > self._p_max):
             raise Tripped(f"set-points {pressures.tolist()} bar leave the range from 0 to {to_bar(self._p_max):g} bar")
         padded = tuple(units.tolist()) + (0,) * (CHANNELS - len(units))
-        self._written.clear()
-        with self._changed:
-            sequence = self._link.set(Set(tick & 0xFFFFFFFF, padded))
-        self._wake()
-        if self._thread is not None:
-            self._written.wait(HAND_OVER_S)
-        return sequence
+        return self._line.hand_over(lambda: self._link.set(Set(tick & 0xFFFFFFFF, padded)))
 
     def beat(self, tick: int) -> None:
         """Publish the control loop's counter on a tick that sends no set-points."""
-        with self._changed:
+        with self._line.changed:
             self._link.tick = tick & 0xFFFFFFFF
 
     def vent(self, mode: VentMode = VentMode.RAMP, timeout_s: float = VENT_WAIT_S) -> bool:
@@ -238,17 +201,17 @@ class Board:
         A lost board is sent nothing (its own timer vents it); this then only listens whether it says so.
         """
         since = self._clock()
-        with self._changed:
+        with self._line.changed:
             if self._link.phase is Phase.READY:
                 self._link.vent(mode)
-                self._wake()
+                self._line.wake()
         if self._link.phase is Phase.READY:
-            self._wait(lambda: self._said_vented(since), self._clock() + timeout_s)
+            self._line.wait(lambda: self._said_vented(since), self._clock() + timeout_s)
         if self._link.phase is Phase.LOST:
             since = self._link.lost_at  # whatever it said from then on still holds: nobody told it to open a valve
             if not self._listened:
                 self._listened = True  # once: nothing more will come after that
-                self._wait(lambda: self._said_vented(since), self._clock() + LOST_VENT_WAIT_S)
+                self._line.wait(lambda: self._said_vented(since), self._clock() + LOST_VENT_WAIT_S)
         return self._said_vented(since)
 
     def _said_vented(self, since: float) -> bool:
@@ -259,8 +222,8 @@ class Board:
 
         Returns as soon as there is none; also where the board's word is too old to tell.
         """
-        self._wait(lambda: not self._pressed(), self._clock() + DOWN_WAIT_S)
-        return {} if self._closed or self.status_age_s > STATUS_SILENCE_S else self._pressed()
+        self._line.wait(lambda: not self._pressed(), self._clock() + DOWN_WAIT_S)
+        return {} if self._line.closed or self.status_age_s > STATUS_SILENCE_S else self._pressed()
 
     def _pressed(self) -> dict[int, float]:
         measured_bar = self.measured_bar
@@ -272,9 +235,9 @@ class Board:
         status = self.status
         if mask is None:
             mask = status.faults if status is not None else 0
-        with self._changed:
+        with self._line.changed:
             self._link.clear_fault(mask)
-        self._wait(lambda: not self._link.busy, self._clock() + CLEAR_WAIT_S)
+        self._line.wait(lambda: not self._link.busy, self._clock() + CLEAR_WAIT_S)
         return self.status is not None and self.status.faults == 0
 
     def close(self) -> bool:
@@ -283,7 +246,7 @@ class Board:
         try:
             return vented or self.vent()
         finally:
-            self._shut()
+            self._line.close()
 
     def __enter__(self) -> Board:
         return self
@@ -296,7 +259,8 @@ class Board:
     # ---- the port
 
     def _await_hello(self) -> None:
-        self._wait(lambda: self._link.phase is not Phase.WAITING, self._clock() + (HELLO_WAIT_S + 1) * (RESETS + 1))
+        deadline = self._clock() + (HELLO_WAIT_S + 1) * (RESETS + 1)
+        self._line.wait(lambda: self._link.phase is not Phase.WAITING, deadline)
         if self._link.foreign_hash is not None:
             raise ProtocolMismatch(
                 f"the board at {self.name} speaks protocol {self._link.foreign_hash:08x}, this version speaks "
@@ -313,83 +277,3 @@ class Board:
             f"nothing at {self.name} announced itself as our board{tried} ({what}); "
             f"another port, or flash the firmware (make -C firmware flash PORT={self.name})"
         )
-
-    @property
-    def _closed(self) -> bool:
-        return self._stop.is_set() or (self._thread is not None and not self._thread.is_alive())
-
-    def _wake(self) -> None:
-        """The thread of the port may sleep in a read; what was asked for is to go out now."""
-        if self._thread is not None and not self._closed:
-            self._port.cancel_read()
-
-    def _wait(self, condition: Callable[[], bool], deadline: float) -> None:
-        """Until `condition`, the loss of the board, or the deadline."""
-        with self._changed:
-            lost = self._link.phase is Phase.LOST
-            while not condition() and self._clock() < deadline and not self._closed:
-                if not lost and self._link.phase is Phase.LOST:
-                    return
-                if self._thread is None:
-                    self._pump()
-                else:
-                    self._changed.wait(0.05)
-
-    def _serve(self) -> None:
-        try:
-            while not self._stop.is_set() and self._pump():
-                pass
-        finally:
-            with self._changed:
-                if not self._stop.is_set():  # a bug: nothing is sent any more, and the loop has to know
-                    self._link.hang_up("the thread of the port ended by an error", self._clock())
-                self._changed.notify_all()
-
-    def _pump(self) -> bool:
-        """One turn: what came, what has to go. False when the port failed."""
-        try:
-            data = b""
-            if self._away:
-                self._stop.wait(READ_WAIT_S)
-            else:
-                data = self._port.read(max(1, self._port.in_waiting))
-            with self._changed:
-                now = self._clock()
-                if data:
-                    self._link.feed(data, now)
-                out = self._link.poll(now)
-                if data or self._link.phase is Phase.LOST:
-                    self._changed.notify_all()
-            if out:
-                self._port.write(out)
-                self._written.set()
-            if self._link.dtr != self._dtr:
-                self._set_dtr(self._link.dtr)
-        except OSError as error:  # pyserial's own errors are OSErrors too
-            with self._changed:
-                self._link.hang_up(f"the port failed ({error})", self._clock())
-            self._stop.set()
-            return False
-        return True
-
-    def _set_dtr(self, level: bool) -> None:
-        """Reset the board: DTR down, then up."""
-        self._dtr = level
-        try:
-            if not self._away:
-                self._port.dtr = level
-                return
-        except OSError:
-            pass
-        # A pseudo-terminal has no such line; what stands behind it takes closing and opening for it.
-        self._away = not level
-        if level:
-            self._port.open()
-        else:
-            self._port.close()
-
-    def _shut(self) -> None:
-        self._stop.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(timeout=1.0)
-        self._port.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import serial
 from serial.tools import list_ports as serial_list_ports
@@ -21,6 +21,20 @@ READ_WAIT_S = 0.005  # how long the I/O thread sleeps in a read; bounds how late
 # The board's own link time-out. pyserial also counts the time for which this process was held up by others, and a
 # shorter wait took that for a port that takes nothing.
 WRITE_WAIT_S = 0.3
+
+
+class Port(Protocol):
+    """What is used of a pyserial port. `read` waits a few milliseconds at most."""
+
+    dtr: bool
+
+    @property
+    def in_waiting(self) -> int: ...
+    def read(self, size: int = 1) -> bytes: ...
+    def cancel_read(self) -> None: ...
+    def write(self, data: bytes) -> int | None: ...
+    def open(self) -> None: ...
+    def close(self) -> None: ...
 
 
 class PortInfo(NamedTuple):

@@ -46,7 +46,7 @@ def test_row_07_plugged_in_again_under_another_name(matrix_row, tmp_path, monkey
             idle_s = again.clock() - plugged["t_us"] * 1e-6
             idle_until_s = again.clock() + 0.5
             while again.clock() < idle_until_s:
-                again.board._pump()
+                again.board._line.pump()
             assert again.board.status.state == State.IDLE, "never by itself"
             again.board.arm(Host.ROBOT)
             assert again.board.status.state == State.ARMED
@@ -64,7 +64,7 @@ def test_row_07_plugged_in_again_under_another_name(matrix_row, tmp_path, monkey
 
 
 def await_state(board, state, limit_s=5.0):
-    board._wait(lambda: board.status is not None and board.status.state == state, board._clock() + limit_s)
+    board._line.wait(lambda: board.status is not None and board.status.state == state, board._clock() + limit_s)
     assert board.status.state == state
 
 

@@ -193,7 +193,7 @@ def test_row_11_the_fault_stays_latched_for_a_host_that_comes_back(fault, error,
             until_s = time.monotonic() + 1.0
             while time.monotonic() < until_s:  # heartbeats go on
                 if not host.threaded:
-                    host.board._pump()
+                    host.board._line.pump()
                 host.board.beat(host.tick + 100)
                 time.sleep(0.005)
             assert (host.board.status.state, host.board.status.faults) == (State.FAULT, fault)

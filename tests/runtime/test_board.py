@@ -139,7 +139,7 @@ def test_set_points_do_not_wait_for_the_end_of_a_read():
         board.set_pressures(1, [0.0])
         assert port.sent.wait(5.0), "the thread of the port slept on"
     finally:
-        board._shut()
+        board._line.close()
 
 
 class ArmedPort(ScriptedPort):

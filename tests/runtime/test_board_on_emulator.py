@@ -38,7 +38,7 @@ def running(emulated):
     board.arm(ROBOT)
     ticks(board, 1, 2)
     yield board, emulated
-    board._shut()
+    board._line.close()
 
 
 def ticks(board, first, count):
