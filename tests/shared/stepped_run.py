@@ -1,0 +1,94 @@
+"""A run as modsoft-runtime makes it, from arming to the closed log, on the clock of a stepped board.
+
+Board, loop, signals, venting and log are the runtime's own; tracker and model are what the test makes of them. Nothing
+of it is disturbed by a busy machine, and a cause can come at any instant. Needs the main thread, for the signals.
+"""
+
+import contextlib
+import math
+
+import numpy as np
+from virtual_loop import PERIOD_S, ROBOT, planar_poses
+
+from modsoft.hil.stepped import SteppedPort
+from modsoft.runtime import session
+from modsoft.runtime.board import Board
+from modsoft.runtime.clock import Ticker
+from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.errors import LostInRun
+from modsoft.runtime.log import RunLog
+from modsoft.runtime.loop import Loop
+from modsoft.runtime.safety import FrameJudge
+from modsoft.runtime.stop import Signals, Stop
+from modsoft.runtime.tally import Tally
+from modsoft.runtime.tracker import Frame, Slot
+
+STEPS = 40
+
+
+class SteppedRun:
+    """`cause(run)` is called `cause_s` after the beginning of arming. After `go`: `error`, what the run raised in the
+    end, and `said`, (emulated seconds, highest duty at that instant, line) of all that it said."""
+
+    history = 3  # of the model
+
+    def __init__(self, emulated, folder, cause, cause_s):
+        self.emulated, self.cause, self.cause_s = emulated, cause, cause_s
+        self.said, self.left, self.error, self.caused_s = [], [], None, math.inf
+        self.port = SteppedPort(emulated)
+        self.clock = self.port.clock
+        self.board = Board(self.port, "the emulated MEGA", self.clock, threaded=False)
+        self._pump, self.board._line.pump = self.board._line.pump, self.pump
+        self.slot, self.stop, self.tally = Slot(), Stop(), Tally(ROBOT, STEPS)
+        self.stop.wait = self.wait
+        self.log = RunLog(folder, ROBOT.name, "", {})
+        self.cause_s += self.clock()
+
+    def pump(self):
+        """A turn of the port's thread; lets time pass."""
+        going_on = self._pump()
+        if self.slot.error is None:
+            at_s = self.clock()
+            frame = Frame(int(at_s * 60), at_s, planar_poses((1.0, 2.0, 3.0)), np.ones(4, bool), np.full(4, 0.1))
+            self.slot.put(frame)
+        if self.cause is not None and self.clock() >= self.cause_s:
+            cause, self.cause, self.caused_s = self.cause, None, self.clock()
+            cause(self)
+        return going_on
+
+    def wait(self, seconds):
+        until_s = self.clock() + seconds
+        while self.clock() < until_s and self.stop.error is None and self.board.lost is None:
+            self.board._line.pump()
+
+    def actuate(self, features):
+        """The model: full pressure on one side of every module, as fast as the limits allow."""
+        return np.ones((ROBOT.modules, 1))
+
+    def say(self, text):
+        self.said.append((self.clock(), max(self.emulated.duties()), text))
+
+    def go(self):
+        """Arms, runs, vents and closes."""
+        desired = from_angles_deg(np.zeros((STEPS, ROBOT.modules)))
+        say, session._say = session._say, self.say
+        error = None
+        try:
+            with Signals(self.stop, self.left.append) as signals:
+                signals.hold()
+                try:
+                    self.board.arm(ROBOT)
+                    judge = FrameJudge(ROBOT)
+                    rest = session._rest(self.slot, judge, self.stop, self.clock, LostInRun)
+                    ticker = Ticker(PERIOD_S, self.clock, self.wait)
+                    Loop(ROBOT, self, desired, self.slot, judge, self.board, ticker, self.stop, self.log.put, self.tally
+                         ).run(rest)  # fmt: skip
+                except BaseException as raised:  # noqa: BLE001 - as in the session itself
+                    error = raised
+                with contextlib.closing(self.board):
+                    session.finish(self.board, self.log, self.tally, self.slot, error)
+        except BaseException as raised:  # noqa: BLE001 - looked at by the test
+            self.error = raised
+        finally:
+            session._say = say
+        return self
