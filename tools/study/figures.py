@@ -28,7 +28,7 @@ PATHS = (
 ERRORS = (
     "Left: mean configuration error of each module over seeds and steps (bars; thin lines: standard deviation over the "
     "steps), beside the paper's and the floor; task B without its first five steps. Right: the error of every step, "
-    "mean over the modules, network alone and with the correction (seed {seed})."
+    "mean over the modules, network alone and with the correction (seed {seed}). All logarithmic."
 )
 CAPTIONS = {
     WORKSPACE: "Figure 4. Where the module ends of the staged and the traditional data were, as many samples of each, "
@@ -44,6 +44,7 @@ CAPTIONS = {
 COLOURS = {"paper": "#9a9a9a", "none": "#1f77b4", "integral": "#2ca02c", "floor": "#d62728"}
 WORDS = {"paper": "paper", "none": "network alone", "integral": "with correction", "floor": "floor"}
 DPI = 110
+LOGARITHMIC = (0.01, 100.0)  # percent
 
 
 def draw(plan: Plan, folder: Folder) -> None:
@@ -148,7 +149,8 @@ def errors(records: Sequence[Record], folder: Folder, model: Model, modules: int
             if any(cells):
                 bars[WORDS[name]] = (COLOURS[name], cells)
         _bars(panels[row, 0], numbers, bars)
-        panels[row, 0].set(title=f"task {task}", ylabel="configuration error, %")
+        # what is reached with the correction would not be seen beside the rest
+        panels[row, 0].set(title=f"task {task}", ylabel="configuration error, %", yscale="log", ylim=LOGARITHMIC)
         for correction in CORRECTIONS:
             kept = flights.read(folder.run(Run(model, task, modules, correction)))
             of_steps = configuration_errors_percent(kept.flight.configuration, kept.desired).mean(axis=1)
