@@ -102,7 +102,7 @@ def reference(network: torch.nn.Module, sizes: Network) -> Reference:
             f"depend on them; train it again"
         )
     unscaled = Reference(features, actuation, 0.0, output_range)
-    return Reference(features, actuation, max(unscaled.error(rounded).values()), output_range)
+    return Reference(features, actuation, float(max(unscaled.error(rounded).values())), output_range)
 
 
 def weights_sha256(weights: Weights) -> str:

@@ -217,6 +217,14 @@ def test_fixed_bound_where_torch_is_exact_and_none_beyond_a_thousandth():
     assert parity.Reference({}, {}, 2e-5, 2.0).tolerance == pytest.approx(4e-4)
 
 
+def test_what_goes_into_the_description_is_a_plain_number(make_checkpoint, tmp_path):
+    """With small weights the bound is a constant; where float32 rounds more, it is what numpy measured."""
+    network, sizes = loaded(make_checkpoint(tmp_path / "model.pt", gain=30.0))
+    expected = parity.reference(network, sizes)
+    assert type(expected.torch_error) is type(expected.tolerance) is float
+    assert expected.torch_error > 0.0
+
+
 def test_a_network_that_ignores_its_neighbours_is_refused(sound, tmp_path, make_checkpoint):
     """The negative control: without recurrent weights a chain is right at once, and so proves nothing."""
     network, sizes = loaded(make_checkpoint(tmp_path / "model.pt"))
