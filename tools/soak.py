@@ -4,7 +4,8 @@ The unmodified modsoft-runtime drives the emulated board, the fake tracker and t
 first third come only faults that a run has to outlast, so that one process is watched for long; then any. Where a fault
 ended the run, as it must, the next one is started on the same board. At the end: whether every fault was noticed and
 named, whether any valve ever had a wrong value, whether memory grew, whether the log can be read. Faults and times are
-drawn with `--seed`. Then, with `--proofs`, the corrupted frames and the failure matrix with their full numbers: hours.
+drawn with `--seed`. Then, with `--proofs`, the failure matrix with its full numbers (tools/reliability.py --full), 10^8
+corrupted frames and 10^6 on the emulated board among them: hours.
 
 Exit code 1 where anything was not as it must be.
 """
@@ -12,11 +13,9 @@ Exit code 1 where anything was not as it must be.
 from __future__ import annotations
 
 import math
-import shlex
 import statistics
 import subprocess
 import sys
-import time
 from collections import defaultdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -37,7 +36,7 @@ from modsoft.runtime.files import written
 ROOT = Path(__file__).resolve().parents[1]
 ROBOT, TASK = "pneumatic-3", "down"
 GROWTH_MIB_PER_H = 4.0  # every tick leaves its figures for the summary: 0.2 kB of it, 9,000 an hour
-PROOFS = ["tools/reliability.py --full"]
+PROOFS = ["tools/reliability.py", "--full"]
 
 
 def growth_mib_per_h(samples: list[tuple[float, float]]) -> float | None:
@@ -126,7 +125,7 @@ def _range(mib: list[float]) -> str:
 @click.option("--out", default=ROOT / "build" / "soak", type=click.Path(file_okay=False, path_type=Path),
               show_default="build/soak", help="A new folder below it gets all traces and report.md.")  # fmt: skip
 @click.option("--report", type=click.Path(dir_okay=False, path_type=Path), help="Write the report here too.")
-@click.option("--proofs", is_flag=True, help="Then the corrupted frames and the failure matrix, full numbers: hours.")
+@click.option("--proofs", is_flag=True, help="Then the failure matrix with its full numbers: hours.")
 def cli(
     minutes: float, every_s: float, seed: int, model: Path | None, out: Path, report: Path | None, proofs: bool
 ) -> int:
@@ -156,7 +155,8 @@ def cli(
         with written(path) as new:
             new.write_text(text, encoding="utf-8")
     click.echo(text)
-    return 0 if prove(proofs) and good else 1
+    proved = not proofs or subprocess.run([sys.executable, *PROOFS], cwd=ROOT, check=False).returncode == 0
+    return 0 if good and proved else 1
 
 
 def tell(each: Injected) -> None:
@@ -164,18 +164,6 @@ def tell(each: Injected) -> None:
     word = "; ".join(each.wrong) or "ok"
     click.echo(f"{each.at_s / 60:5.1f} min, run {each.run}: {each.fault.name}: {word}")
     sys.stdout.flush()
-
-
-def prove(proofs: bool) -> bool:
-    """The long commands; whether all of them succeeded."""
-    good = True
-    for command in PROOFS if proofs else []:
-        click.echo(f"$ {command}")
-        began_s = time.monotonic()
-        code = subprocess.run([sys.executable, *shlex.split(command)], cwd=ROOT, check=False).returncode
-        click.echo(f"exit code {code} after {(time.monotonic() - began_s) / 60:.0f} minutes")
-        good &= code == 0
-    return good
 
 
 main = entry(cli)
