@@ -37,7 +37,7 @@ reliability: $(INSTALLED)
 
 # An hour of the rig with a fault about once a minute, then the long proofs.
 soak: $(INSTALLED)
-	.venv/bin/python tools/soak.py --proofs
+	.venv/bin/python tools/soak.py --report docs/soak.md --proofs
 
 check: $(INSTALLED)
 	tools/check.sh

@@ -13,6 +13,7 @@ Exit code 1 where anything was not as it must be.
 from __future__ import annotations
 
 import math
+import os
 import statistics
 import subprocess
 import sys
@@ -132,7 +133,7 @@ def cli(
     model = model or shipped.model(ROBOT)
     Controller.load(model)
     build(choose())
-    began = datetime.now(UTC)
+    began, load = datetime.now(UTC), os.getloadavg()[1]
     folder = out / f"{began:%Y%m%dT%H%M%SZ}"
     if folder.exists():
         raise UsageError(f"{folder} exists; start again")
@@ -145,7 +146,8 @@ def cli(
     host = log.host()
     about = {
         "made by": f"`tools/soak.py --minutes {minutes:g} --every {every_s:g} --seed {seed}`, {began:%Y-%m-%d}",
-        "on": f"{host['system']}, {host['cores']} cores",
+        "on": f"{host['system']}, {host['cores']} cores, load average {load:.1f} before, {os.getloadavg()[1]:.1f} at the "
+        f"end{', at real-time priority' if os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR) else ''}",
         "board": board_in_words(board.board),
         "firmware, SHA-256": firmware_sha256(board.board),
         "robot, task": f"{ROBOT}, {TASK}, again and again",
