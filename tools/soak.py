@@ -146,8 +146,9 @@ def cli(
     host = log.host()
     about = {
         "made by": f"`tools/soak.py --minutes {minutes:g} --every {every_s:g} --seed {seed}`, {began:%Y-%m-%d}",
-        "on": f"{host['system']}, {host['cores']} cores, load average {load:.1f} before, {os.getloadavg()[1]:.1f} at the "
-        f"end{', at real-time priority' if os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR) else ''}",
+        "on": f"{host['system']}, {host['cores']} cores",
+        "load average": f"{load:.1f} before, {os.getloadavg()[1]:.1f} at the end"
+        f"{'; at real-time priority' if os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR) else ''}",
         "board": board_in_words(board.board),
         "firmware, SHA-256": firmware_sha256(board.board),
         "robot, task": f"{ROBOT}, {TASK}, again and again",
