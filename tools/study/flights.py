@@ -23,7 +23,7 @@ from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import written
 from modsoft.runtime.trajectory import task
 from modsoft.study import disturb, making
-from modsoft.study.folder import Folder
+from modsoft.study.folder import NOT_READABLE, Folder
 from modsoft.study.plan import Plan, Run
 from modsoft.study.work import Stage, Told
 from modsoft.training import evaluate, fleet
@@ -140,7 +140,7 @@ def read(path: Path) -> Kept:
     try:
         with np.load(path, allow_pickle=False) as file:
             return Kept(Flight(*(file[name] for name in Flight._fields)), file["desired"])
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except NOT_READABLE as error:
         raise ModelError(f"{path}: no run that can be read ({error}); delete it and fly again") from error
 
 
@@ -149,5 +149,5 @@ def meta(path: Path) -> dict[str, Any] | None:
     try:
         with np.load(path, allow_pickle=False) as file:
             return json.loads(str(file["meta"]))
-    except (OSError, ValueError, KeyError, EOFError):
+    except NOT_READABLE:
         return None

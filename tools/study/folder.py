@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from pathlib import Path
 
 from modsoft.runtime.errors import OutputError
 from modsoft.study.plan import Model, Run
+
+# What numpy raises for a file of arrays that is none, or damaged.
+NOT_READABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 class Folder:

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from modsoft.runtime import artefact
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import written
-from modsoft.study.folder import Folder
+from modsoft.study.folder import NOT_READABLE, Folder
 from modsoft.study.plan import Data, Model, Plan
 from modsoft.study.work import Stage, Told
 from modsoft.training import checkpoint as checkpoints
@@ -123,3 +124,13 @@ def _estimate(plan: Plan, folder: Folder, model: Model, told: Told) -> None:
     errors = train.estimation_errors(checkpoints.network_of(checkpoint), test).numpy()
     with written(folder.estimate(model)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, error_percent=errors)
+
+
+def estimated(folder: Folder, model: Model) -> NDArray[np.float32]:
+    """Errors of estimation (W, N, A), % of the actuation range; `ModelError` where there are none to be read."""
+    path = folder.estimate(model)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return file["error_percent"]
+    except NOT_READABLE as error:
+        raise ModelError(f"{path}: no estimation errors that can be read ({error}); delete it and go on") from error

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from modsoft.runtime.configuration import angle_between_deg
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import written
-from modsoft.study import flights, paper
+from modsoft.study import flights, making, paper
 from modsoft.study.flights import Kept
 from modsoft.study.folder import Folder
-from modsoft.study.making import settings_of
 from modsoft.study.plan import Plan, Run
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import coverage
@@ -89,7 +88,7 @@ def about(plan: Plan, folder: Folder) -> dict[str, Any]:
     for model in plan.models:
         said = checkpoints.load(folder.checkpoint(model))["provenance"]
         kept = {key: said.get(key) for key in ("iterations_done", "seconds", "samples", "windows", "data_sha256")}
-        models.append({"model": model.name, "settings": asdict(settings_of(plan, model)), **kept})
+        models.append({"model": model.name, "settings": asdict(making.settings_of(plan, model)), **kept})
     return {
         "code_version": version("modsoft"),
         "seeds": plan.seeds,
