@@ -41,7 +41,8 @@ HELLO_WAIT_S = 3.0  # then the board is reset through DTR
 RESETS = 3
 RESET_PULSE_S = 0.1
 RUNNING_AFTER_S = 1.5  # the bootloader's window is over by then: a STATUS means the firmware runs and can be asked
-STRANGER_AFTER_S = 2.5  # a second after that: our firmware would have said ten things
+STRANGER_AFTER_S = 2.5  # a second after that
+STRANGER_TALKS_S = 0.5  # in which our firmware would have said five things
 STATUS_SILENCE_S = 0.35  # three at 10 Hz, and a little
 ACK_WAIT_S = 0.2  # twenty times the usual round trip
 MISSED_ACKS = 3
@@ -96,7 +97,7 @@ class Link:
         self._parser = Parser()
         self._asked_at = self._opened_at = now
         self._resettable = resettable
-        self._late_bytes = 0  # that came when the firmware had to be running
+        self._talks_since: float | None = None  # bytes of any kind, from when on the firmware had to be running
         self._pulse_until: float | None = None
         self._heartbeat_due = now
         self._board_session = 0
@@ -162,8 +163,8 @@ class Link:
     def feed(self, data: bytes, now: float) -> None:
         """Take what came from the port."""
         self.counts["bytes"] += len(data)
-        if now - self._opened_at >= RUNNING_AFTER_S:
-            self._late_bytes += len(data)
+        if self._talks_since is None and now - self._opened_at >= RUNNING_AFTER_S:
+            self._talks_since = now
         for frame in self._parser.feed(data):
             if isinstance(frame, ForeignHello):
                 self._on_foreign(frame.protocol_hash, now)
@@ -283,8 +284,8 @@ class Link:
             self._opened_at = now  # asked again after the same time
             return encode(HelloReq(PROTOCOL_HASH))
         # A device that runs something else is not made ours by a reset.
-        stranger = self.status is None and (self._late_bytes > 0 or not self._resettable)
-        if stranger and now - self._asked_at >= STRANGER_AFTER_S:
+        talks = self._talks_since is not None and now - self._talks_since >= STRANGER_TALKS_S
+        if self.status is None and (talks or not self._resettable) and now - self._asked_at >= STRANGER_AFTER_S:
             self.gave_up = True
             self._lose("what is there does not speak this protocol", now)
         elif now - self._asked_at >= HELLO_WAIT_S:
@@ -293,7 +294,7 @@ class Link:
                 self._lose("nothing announced itself", now)
             else:
                 self.resets += 1
-                self._late_bytes = 0
+                self._talks_since = None
                 self.dtr = False
                 self._pulse_until = now + RESET_PULSE_S
         return b""

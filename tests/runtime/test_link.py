@@ -91,6 +91,16 @@ def test_what_came_before_the_firmware_could_run_says_nothing():
     assert (link.phase, link.resets, link.dtr) == (Phase.WAITING, 1, False)
 
 
+def test_an_announcement_that_is_just_coming_in_is_waited_for():
+    link = Link(0.0)
+    announcement = encode(HELLO)
+    link.feed(announcement[:9], 2.49)
+    link.poll(2.5)
+    assert link.phase is Phase.WAITING
+    link.feed(announcement[9:], 2.51)
+    assert link.phase is Phase.READY
+
+
 def test_a_board_that_was_running_is_ours_whatever_else_came():
     link = Link(0.0)
     link.feed(b"noise", 1.6)
