@@ -31,7 +31,7 @@ static void start(uint8_t input) {
 static void next(struct sensors *sensors) {
   do {
     sensors->input++;
-    if (sensors->input == SETTLING && ++sensors->rounds < ROUNDS_PER_SUPPLY && SENSORS != 0) {
+    if (sensors->input == SETTLING && ++sensors->rounds < ROUNDS_PER_SUPPLY && SENSORS) {
       sensors->input = 0;
     } else if (sensors->input > SUPPLY) {
       sensors->input = 0;
@@ -45,7 +45,6 @@ void sensors_begin(struct sensors *sensors) {
     sensors->measured[channel] = PROTOCOL_NOT_MEASURED;
   }
   sensors->supply_mv = 0;
-  sensors->rounds = 0;
   sensors->input = SETTLING;
   DIDR0 = SENSORS;
   ADCSRB = 0;

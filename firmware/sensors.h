@@ -14,7 +14,7 @@ struct sensors {
   int16_t measured[PROTOCOL_CHANNELS]; /* 10 Pa; PROTOCOL_NOT_MEASURED without a sensor or before its first reading */
   uint16_t supply_mv;                  /* 5 V rail; 0 before its first reading */
   uint8_t input;                       /* being converted */
-  uint8_t rounds;
+  uint8_t rounds;                      /* since the supply was measured */
 };
 
 void sensors_begin(struct sensors *sensors);

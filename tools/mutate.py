@@ -60,7 +60,8 @@ class Mutant:
     @property
     def name(self) -> str:
         """As in the list of equivalents, which must outlive a change of line numbers."""
-        return f"{self.source}: {self.before.strip()} -> {self.after.strip() or '(left out)'}"
+        before, after = (code.rstrip("\\ ").strip() for code in (self.before, self.after))
+        return f"{self.source}: {before} -> {after or '(left out)'}"
 
 
 def _without_comments(text: str) -> str:
