@@ -18,7 +18,7 @@ from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.files import check_writable, written
 from modsoft.training import checkpoint as checkpoints
 
-GOLDEN_MODULES = (2, 6)  # where the network takes any number
+GOLDEN_MODULES = (2, 4)  # where the network takes any number
 
 
 @dataclass(frozen=True)

@@ -246,3 +246,18 @@ def test_a_network_deaf_to_its_features_is_refused(make_checkpoint, tmp_path):
     with pytest.raises(ModelError, match="depend on them"):
         export(make_checkpoint(tmp_path / "model.pt", gain=0.0))
     assert [entry.name for entry in tmp_path.iterdir()] == ["model.pt"]
+
+
+def test_over_many_modules_a_network_is_compared_only_where_float32_tells_something(make_checkpoint, tmp_path):
+    """Large recurrent weights make the row of modules chaotic: rounding then grows from module to module."""
+    network, sizes = loaded(make_checkpoint(tmp_path / "model.pt", layers=4, hidden=64))
+    tame = parity.reference(network, sizes)
+    assert list(tame.features) == list(parity.MODULES)
+    with torch.no_grad():
+        for name, weight in network.named_parameters():
+            if "weight_hh" in name:
+                weight.mul_(40.0)
+    wild = parity.reference(network, sizes)
+    assert list(wild.features) == list(wild.actuation)
+    assert {2, 3, 4} <= set(wild.features)
+    assert 64 not in wild.features

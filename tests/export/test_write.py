@@ -66,7 +66,7 @@ def test_description_says_all(model):
     assert said.features == stored["features"]
     assert said.robot["robot"]["name"] == "pneumatic-3"
     assert said.provenance == stored["provenance"]
-    assert [len(pair.features) for pair in said.golden] == [2, 6]
+    assert [len(pair.features) for pair in said.golden] == [2, 4]
     assert len(said.file_sha256) == 64
     assert said.file_sha256 != "0" * 64
 

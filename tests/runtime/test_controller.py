@@ -141,7 +141,7 @@ def test_no_file(tmp_path):
         (lambda t: t["network"].update(history=4), "time steps T 4, expected 3"),
         (lambda t: t.update(tolerance=0.0), "tolerance"),
         (lambda t: t.update(golden=[]), "no golden pair"),
-        (lambda t: t["golden"][1]["actuation"][5].__setitem__(0, 0.5), "golden pair of 6 modules"),
+        (lambda t: t["golden"][1]["actuation"][3].__setitem__(0, 0.5), "golden pair of 4 modules"),
         (lambda t: t["golden"][0]["actuation"].pop(), "golden pair of 2 modules"),
         (lambda t: t["golden"][0]["features"][0].__setitem__(0, None), "golden"),
     ],
