@@ -61,7 +61,7 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
     )
     if said.network.modules is None and (left := set(parity.MODULES) - set(report.fused)):
         over = ", ".join(map(str, sorted(left)))
-        click.echo(f"not compared over {over} modules: there this network amplifies float32's rounding too much to tell")
+        click.echo(f"not compared over {over} modules: there this network amplifies float32's rounding too much")
     click.echo("  modules     " + "".join(f"{modules:>10}" for modules in report.fused))
     for name, errors in (
         ("one run", report.fused),
