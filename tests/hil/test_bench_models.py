@@ -20,5 +20,5 @@ def test_it_tells_every_model_task_and_correction(tmp_path):
     ).stdout
     found = json.loads(out.read_text())
     assert found["quick"] is True
-    assert len(found["rows"]) == len(told.splitlines()) - 2 == 4 * 4 + 2 * 3 * 2 - 8
+    assert len(found["rows"]) == len(told.splitlines()) - 2 == 2 * 2 * 2 + 2 * 3 * 2
     assert all(0.0 <= value < 100.0 for row in found["rows"] for value in row["error"])
