@@ -18,8 +18,8 @@ from modsoft.runtime.errors import UsageError
 Array = NDArray[np.float64]
 
 # How much of an error that stays the same is taken off in each period. Chosen on random smooth references of four and
-# six modules, never on the tasks that are reported: more takes off more, but from 0.5 on some robots of six modules swing
-# at the edge of their workspace. With 0.5 degrees of noise 0.3 leaves less than 0.5 does.
+# six modules, never on the tasks that are reported: more takes off more, but from 0.5 on some robots of six modules
+# swing at the edge of their workspace. With 0.5 degrees of noise 0.3 leaves less than 0.5 does.
 GAIN = 0.4
 LARGEST_SHIFT = 0.4  # of the unit vector
 
