@@ -254,7 +254,6 @@ static void on_frame(struct controller *c, const struct frame *frame, uint32_t n
       break;
     default: /* MESSAGE_CLEAR_FAULT: every other type has been refused above */
       on_clear_fault(c, frame);
-      break;
   }
 }
 

@@ -604,3 +604,39 @@ def test_board_never_waits_for_a_host_that_does_not_read(board):
     assert board.state == State.RUNNING
     board.parser = protocol.Parser()
     assert board.messages()  # whole frames only, none cut in two
+
+
+def test_clearing_a_fault_is_answered_at_once(running):
+    running.wait(400)  # nothing heard: the link's timer
+    until_vented(running)
+    running.measured[:6] = [0] * 6
+    running.wait(1)
+    running.messages()
+    (answer,) = running.tell(ClearFault(running.faults))
+    assert isinstance(answer, Status)
+    assert (answer.state, answer.faults) == (State.IDLE, 0)
+
+
+def test_every_frame_of_the_board_carries_the_session(board):
+    told = []
+    for _ in range(3):
+        board.beat(1100)
+        board.arm()
+        board.messages()
+        board.wait(100)
+        told += [frame.session for frame in board.messages()]
+        board.tell(Vent(VentMode.RAMP))
+    assert told == [1, 2, 3]
+
+
+@pytest.mark.parametrize(("channel", "fault"), [(3, Fault.SENSOR), (2, Fault(0)), (4, Fault(0))])
+def test_only_a_channel_of_this_robot_can_disagree(board, channel, fault):
+    """Armed for channel 3 alone: what is measured on its neighbours is not this robot's."""
+    board.beat(1100)
+    board.arm(channels=1 << 3)
+    board.set(0, 0, 0, 1000)
+    for _ in range(40):
+        board.beat(100)
+        board.follow()
+        board.measured[channel] += 1500
+    assert board.faults == fault

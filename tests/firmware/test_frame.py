@@ -65,3 +65,22 @@ def test_arbitrary_bytes_do_no_harm(sanitised, data):
     sanitised.board_feed(from_new, data, len(data), 0)
     assert sanitised.board_state(from_new) == protocol.State.BOOT
     sanitised.board_free(from_new)
+
+
+def test_a_good_frame_with_more_behind_it_in_the_same_frame_is_dropped(board):
+    """What fills the parser to its last byte is right, but the frame goes on."""
+    body = bytes((0x7F, 5, 0)) + bytes(range(1, protocol.MAX_DECODED - 6))
+    board.messages()
+    board.feed(b"\0" + cobs.cobs_encode(body + zlib.crc32(body).to_bytes(4, "little") + b"\x11\x12") + b"\0")
+    assert board.messages() == []
+    assert board.library.board_rx_bad(board.handle) == 1
+
+
+def test_only_the_end_of_a_good_frame_is_told_so(board):
+    """The sketch takes one good frame a pass."""
+    receive = board.library.controller_receive
+    receive.restype = ctypes.c_bool
+    good = b"\0" + protocol.encode(protocol.HelloReq(protocol.PROTOCOL_HASH), 1, 0).lstrip(b"\0")
+    told = [receive(board.handle, byte, ctypes.c_uint32(5)) for byte in good]
+    assert told == [False] * (len(good) - 1) + [True]
+    assert not any(receive(board.handle, byte, ctypes.c_uint32(5)) for byte in b"\0\x05\x05\0")
