@@ -86,3 +86,13 @@ def test_an_error_that_is_never_reached_is_said(bench):
     assert none["ratios"]["time_to_target"] is None
     assert bench.table(none).count("not reached") == 2
     json.dumps(none, allow_nan=False)
+
+
+def test_the_smallest_error_that_both_reached(bench):
+    def told(*points):
+        return [{"cpu_s": at, "percent": percent} for at, percent in points]
+
+    ours = told((1.0, float("inf")), (3.0, 2.0), (6.0, 1.0))
+    authors = told((2.0, float("inf")), (12.0, 2.5), (22.0, 1.5), (32.0, 1.4))
+    assert bench.same_error(ours, authors) == {"percent": 1.4, "ours_s": 5.0, "authors_s": 30.0, "ratio": 6.0}
+    assert bench.same_error(ours, authors[:1]) is None

@@ -223,6 +223,17 @@ def compared(race: Race, one: dict[str, Any], other: dict[str, Any]) -> dict[str
     }
 
 
+def same_error(one: list[dict[str, Any]], other: list[dict[str, Any]]) -> dict[str, float] | None:
+    """The smallest error that both ways reached, the processor time of each to it, and how many times as fast ours was;
+    None where one of them has not looked at its error yet."""
+    percent = max(min(line["percent"] for line in told) for told in (one, other))
+    if not np.isfinite(percent):
+        return None
+    reached = [next(line for line in told if line["percent"] <= percent) for told in (one, other)]
+    ours_s, authors_s = (line["cpu_s"] - told[0]["cpu_s"] for line, told in zip(reached, (one, other), strict=True))
+    return {"percent": percent, "ours_s": ours_s, "authors_s": authors_s, "ratio": authors_s / ours_s}
+
+
 def raced(race: Race, minutes: float, turn_s: float) -> dict[str, Any]:
     """Both in turns until both are there, or for so many minutes by the clock."""
     with contextlib.ExitStack() as stack:
@@ -240,7 +251,9 @@ def raced(race: Race, minutes: float, turn_s: float) -> dict[str, Any]:
         silent = [way for way, runner in runners.items() if len(runner.told) < 2]
         if silent:
             raise click.ClickException(f"{', '.join(silent)}: no turn within {minutes:g} minutes; give more --minutes")
-        return compared(race, *(figures(runners[way].told, race.target_percent) for way in WAYS))
+        told = [runners[way].told for way in WAYS]
+        result = compared(race, *(figures(each, race.target_percent) for each in told))
+        return result | {"same_error": same_error(*told)}
 
 
 def table(result: dict[str, Any]) -> str:
@@ -261,6 +274,10 @@ def table(result: dict[str, Any]) -> str:
     if ratios["time_to_target"]:
         least = "at least " if result["ratio_is_lower_bound"] else ""
         lines += [f"to the same error: {least}{ratios['time_to_target']:.2f} times as fast"]
+    same = result.get("same_error")
+    if same:
+        lines += [f"to {same['percent']:.2f} %, the smallest error that both reached: {same['ours_s']:.0f} s and "
+                  f"{same['authors_s']:.0f} s, {same['ratio']:.2f} times as fast"]  # fmt: skip
     return "\n".join(lines)
 
 
