@@ -12,6 +12,9 @@ from runtime_in_run import Run, Stand, if_begun
 pytestmark = pytest.mark.realtime
 
 LIMIT_S = 3 * 0.4 + 0.05
+# Row 15 sets no time. A delayed frame is used while it is younger than a period, so that the three bad ticks may begin
+# a period later than with a tracker that fails at once: 1.56 s was seen.
+LATER_LIMITS_S = {"frames 1 s old": LIMIT_S + 0.4}
 LATE_HOST_MS = 5.0
 # The fault, its row, the exit code, and what is said of it.
 FAULTS = {
@@ -34,7 +37,8 @@ def test_rows_13_14_15_18_19_tracker_in_trouble_on_the_line(matrix_row, full, mo
 
     @if_begun
     def attempt(number, again=2):
-        fault, _, code, word = FAULTS[attempts[number]]
+        name = attempts[number]
+        fault, _, code, word = FAULTS[name]
         with Stand() as stand, Run(stand, model_file, tmp_path / f"{number}-{again}") as run:
             run.wait_for(lambda: run.ticks() >= 3)
             time.sleep(phases_s[number])
@@ -49,16 +53,20 @@ def test_rows_13_14_15_18_19_tracker_in_trouble_on_the_line(matrix_row, full, mo
             assert log.ticks[len(log.ticks) - len(bad) :] == bad, "once lost, never used again"
             assert all(line["commanded_bar"] == log.ticks[-1 - len(bad)]["commanded_bar"] for line in bad[:-1])
             took_s = (log.events[-1]["mono_ns"] - began_ns) * 1e-9
-        if took_s > LIMIT_S and again and max(line["late_ms"] for line in log.ticks[-4:]) > LATE_HOST_MS:
+        late_ms = max(line["late_ms"] for line in log.ticks[-4:])
+        if took_s > LATER_LIMITS_S.get(name, LIMIT_S) and again and late_ms > LATE_HOST_MS:
             return attempt(number, again - 1)  # the log itself says that this host had no time
         return took_s
 
     took_s = side_by_side(len(attempts), attempt, 5)
+    late = []
     for name, (_, row, _, _) in FAULTS.items():
+        limit_s = LATER_LIMITS_S.get(name, LIMIT_S)
         worst_s = max(took for told, took in zip(attempts, took_s, strict=True) if told == name)
-        matrix_row(row, fault=f"{name}, on the line", tries=tries, limit="vent begins within 1.25 s",
+        matrix_row(row, fault=f"{name}, on the line", tries=tries, limit=f"vent begins within {limit_s:.2f} s",
                    worst=f"{worst_s:.2f} s", clock="host")  # fmt: skip
-    assert max(took_s) <= LIMIT_S
+        late += [name] if worst_s > limit_s else []
+    assert late == []
 
 
 def test_row_18_one_bad_moment_is_waited_out_on_the_line(matrix_row, model_file, tmp_path):
