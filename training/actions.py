@@ -83,7 +83,8 @@ def _smooth(robot: Robot, steps: int, rng: np.random.Generator) -> Array:
         else:
             full = rng.uniform() < 0.5
             actions[:, module] = _wander(steps, robot.action_size, rng) * (1.0 if full else rng.uniform(0.2, 1.0))
-    jitter = np.exp(rng.uniform(*np.log(JITTER), robot.modules))[:, None]
+    least, most = np.log(JITTER)
+    jitter = np.exp(rng.uniform(least, most, robot.modules))[:, None]
     actions = np.clip(actions + jitter * rng.uniform(-1.0, 1.0, shape), -1.0, 1.0)
     previous = np.zeros(shape[1:])
     for step in range(steps):
