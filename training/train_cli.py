@@ -28,7 +28,7 @@ from modsoft.runtime.files import check_writable
 @click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Time that ends the run if it is first.")
 @click.option("--batch", type=click.IntRange(1), help="Windows in a step.  [default: 64 cable, 128 pneumatic]")
 @click.option("--rate", default=3e-3, type=click.FloatRange(0, 1e6, min_open=True), help="Peak learning rate.")
-@click.option("--dropout", default=0.05, type=click.FloatRange(0, 1, max_open=True), help="Between the layers.")
+@click.option("--dropout", default=0.0, type=click.FloatRange(0, 1, max_open=True), help="Between the layers.")
 @click.option(
     "--shorter",
     type=click.FloatRange(0, 1),
@@ -43,6 +43,12 @@ from modsoft.runtime.files import check_writable
     help="blocks: contiguous in time, nothing shared. shuffled: as the paper did, which leaks.",
 )
 @click.option("--seed", default=0, type=click.IntRange(0), help="The same seed gives the same model.")
+@click.option(
+    "--precision",
+    default="float32",
+    type=click.Choice(["float32", "bfloat16"]),
+    help="Of the network's products. bfloat16: as good, and twice as fast on processors with AMX.",
+)
 @click.option("--threads", default=1, type=click.IntRange(1), help="Cores; more than are free is far slower than one.")
 def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
     """Train a network of the paper's Table S1, by default the bidirectional LSTM, on one or more data sets of
