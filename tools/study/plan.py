@@ -116,9 +116,9 @@ def full() -> Plan:
         floors=tuple((task, modules) for modules in (4, 6) for task in TASKS),
         settings={
             ("module-lstm", "paper"): {"batch": 128, "iterations": 1500},
-            ("lstm", "paper"): {"batch": 128, "iterations": 3000},
+            ("lstm", "paper"): {"batch": 128, "iterations": 6000},
             ("bilstm", "paper"): {"batch": 128, "iterations": 2500},
-            ("bilstm", "rich"): {"batch": 128, "iterations": 14000},
+            ("bilstm", "rich"): {"batch": 256, "iterations": 20000},
         },
     )
 
