@@ -84,7 +84,7 @@ def one_cycle(share: float, peak: float) -> float:
 
 def fastest_precision() -> str:
     """bfloat16 where the processor has units for its products (AMX), on which a step takes half the time and less."""
-    told = getattr(torch.cpu, "get_capabilities", dict)()  # newer than the oldest torch that will do
+    told: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # newer than the oldest torch that will do
     return "bfloat16" if told.get("amx_bf16") else "float32"
 
 
