@@ -47,7 +47,7 @@ from modsoft.runtime.files import check_writable
     "--precision",
     default="float32",
     type=click.Choice(["float32", "bfloat16"]),
-    help="Of the network's products. bfloat16: as good, and twice as fast on processors with AMX.",
+    help="Of the network's products. bfloat16: as good, and faster on processors with AMX, by half or more.",
 )
 @click.option("--threads", default=1, type=click.IntRange(1), help="Cores; more than are free is far slower than one.")
 def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:

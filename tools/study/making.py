@@ -66,9 +66,8 @@ def train_s(plan: Plan, folder: Folder, model: Model) -> float:
 
 def settings_of(plan: Plan, model: Model) -> train.Settings:
     given = plan.settings.get((model.network, model.data), {})
-    asked = {"network": model.network, "split": model.split, "seed": model.seed, **given}
-    asked["precision"] = train.fastest_precision()
-    return train.Settings(**{**train.BY_KIND["cable"], **asked})
+    asked = {"network": model.network, "split": model.split, "seed": model.seed, "precision": train.fastest_precision()}
+    return train.Settings(**train.BY_KIND["cable"] | asked | given)
 
 
 def _train(plan: Plan, folder: Folder, model: Model, told: Told) -> None:
