@@ -118,7 +118,7 @@ def full() -> Plan:
             ("module-lstm", "paper"): {"batch": 128, "iterations": 1500},
             ("lstm", "paper"): {"batch": 128, "iterations": 6000},
             ("bilstm", "paper"): {"batch": 128, "iterations": 2500},
-            ("bilstm", "rich"): {"batch": 256, "iterations": 20000},
+            ("bilstm", "rich"): {"batch": 256, "iterations": 12000},
         },
     )
 
