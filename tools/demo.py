@@ -19,6 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from modsoft.hil import report_folder
+from modsoft.runtime.errors import ModsoftError
+
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = Path("demo")
 ROBOT, TASK = "pneumatic-3", "down"
@@ -41,6 +44,11 @@ class Stage:
             for path in sorted(Path(".").glob(pattern)):
                 digest.update(f"\0{path}\0".encode() + path.read_bytes())
         return digest.hexdigest()
+
+    @property
+    def results(self) -> list[Path]:
+        """What the command leaves, finished or interrupted."""
+        return [self.makes, *(self.makes.with_name(self.makes.name + suffix) for suffix in (".parts", ".resume"))]
 
     @property
     def stamp(self) -> Path:
@@ -97,9 +105,13 @@ def make(stage: Stage, number: str) -> int:
         print(f"{number} {stage.title}: {stage.makes} is up to date", flush=True)
         return 0
     print(f"{number} {stage.title}", flush=True)
+    existing = [path for path in stage.results if path.exists()]
+    if existing and not before:
+        print(f"demo: {existing[0]}: not made by the demo; move it elsewhere", file=sys.stderr)
+        return 2
     if before != digest:  # what is there, finished or half done, was made from something else
-        for old in (stage.makes, *FOLDER.glob(f"{stage.makes.name}.*")):
-            shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
+        for old in existing:
+            shutil.rmtree(old) if old.is_dir() else old.unlink()
     stage.stamp.write_text(digest)  # first, so that an interrupted stage goes on
     started_s = time.monotonic()
     code = run(stage.command)
@@ -137,7 +149,11 @@ def main() -> int:
             return code
     print(f"[{count}/{count}] run it on the emulated board, the fake tracker and the simulated robot", flush=True)
     found = REPORT / "report.json"
-    found.unlink(missing_ok=True)  # whatever is shown below is of this run
+    try:
+        report_folder.drop_report(REPORT)  # whatever is shown below is of this run
+    except ModsoftError as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return error.exit_code
     code = run(RUN)
     if found.is_file():
         print()

@@ -27,6 +27,8 @@ from modsoft.runtime.files import NOT_AN_ARRAY, written
 from modsoft.training.dataset import Episode
 
 EPISODE = re.compile(r"episode-([0-9]{6}|[1-9][0-9]{6,8})\.npz")
+STALE = re.compile(r"\.(episode-[0-9]+\.npz|recipe\.json)\..*\.tmp")
+JOBS = re.compile(r"jobs-[0-9a-f]{32}")  # of `backends.by_submitit`
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,9 @@ class Shards:
 
     def open(self, recipe: dict[str, Any]) -> None:
         """Begins in the folder, or checks that what is there belongs to the same recipe (`ModelError`)."""
-        for stale in self.folder.glob(".*.tmp"):  # of a process that was killed while it wrote
-            self._drop(stale)
+        for stale in self.folder.iterdir():
+            if STALE.fullmatch(stale.name):  # of a process that was killed while it wrote
+                self._drop(stale)
         told = self.folder / "recipe.json"
         if told.is_file():
             try:
@@ -83,6 +86,8 @@ class Shards:
                 raise ModelError(f"{told}: cannot be read ({error}); delete its folder to start anew") from error
             refuse_other(found, recipe, self.folder)
             return
+        if self.finished():
+            raise ModelError(f"{self.folder}: episodes without the recipe of modsoft-collect; choose another --out")
         with written(told) as temporary:
             temporary.write_text(json.dumps(recipe, indent=1), encoding="utf-8")
 
@@ -130,11 +135,22 @@ class Shards:
             np.savez(file, **episode._asdict())
 
     def remove(self) -> None:
-        """Takes the folder away at one stroke; a worker still at work for a killed collection finds it gone."""
-        if self.folder.exists():
+        """Takes the folder away at one stroke; a worker still at work for a killed collection finds it gone. Where
+        others put files there, it deletes what a collection wrote and leaves the rest."""
+        if not self.folder.exists():
+            return
+        own = [path for path in self.folder.iterdir() if _is_own(path.name)]
+        if len(own) < len(os.listdir(self.folder)):
+            for path in own:
+                shutil.rmtree(path, ignore_errors=True) if path.is_dir() else self._drop(path)
+        else:
             trash = self.folder.with_name(f".{self.folder.name}.{socket.gethostname()}.{os.getpid()}.tmp")
             os.replace(self.folder, trash)
             shutil.rmtree(trash, ignore_errors=True)
+
+
+def _is_own(name: str) -> bool:
+    return name in ("lock", "recipe.json") or any(each.fullmatch(name) for each in (EPISODE, STALE, JOBS))
 
 
 def _own(path: str, flags: int) -> int:

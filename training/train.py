@@ -6,6 +6,7 @@ weights, bit for bit, as one that was not (with the same number of threads on th
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
 import time
@@ -138,7 +139,10 @@ def train(
     check_writable(out)
     if out.exists():
         made = _finished(out, identity)
-        resume.unlink(missing_ok=True)  # killed between the last two lines below
+        with contextlib.suppress(ModelError):  # a file that this training did not write
+            if resume.is_file():  # killed between the last two lines below
+                _resumed(resume, identity)
+                resume.unlink()
         return made
     state = _fit(network, training, validation, settings, identity, resume, progress, clock)
     if state["best"] is None or state["best_percent"] > 100.0:  # worse than any guess within the range can be

@@ -3,15 +3,15 @@
 import click
 import pytest
 
-from modsoft.hil import cli, report, rig
-from modsoft.runtime.errors import OutputError, UsageError
+from modsoft.hil import cli, report_folder, rig
+from modsoft.runtime.errors import InUse, OutputError, UsageError
 
 
 class Interrupted:
     """A rig that ends with Ctrl-C after it has written all that a rig writes."""
 
     def __init__(self, robot_file, folder, board):
-        self.folder, self.runs = folder, folder / "runs"
+        self.folder, self.runs = folder, folder / "runtime-log-1"
 
     def __enter__(self):
         (self.folder / "board.jsonl").write_text("new")
@@ -45,31 +45,52 @@ def order(tmp_path, model_file, monkeypatch):
     return run
 
 
-def test_a_report_is_never_overwritten(tmp_path, order):
-    (tmp_path / "out").mkdir()
-    for name in (report.FINISHED, "run.jsonl"):
+def texts(folder):
+    return {str(path.relative_to(folder)): path.read_text() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("files", "says"),
+    [
+        (["report.json", "run.jsonl"], "holds the report of a run already; give another --report"),
+        (["runs/20260101T090000Z-pneumatic-3/run.jsonl"], r"files that modsoft-hil did not write \(such as runs\)"),
+        (["run.jsonl", "meta.json", "robot.toml"], "give a new or empty folder"),
+        (["angles.png"], "give a new or empty folder"),
+        (["robot.toml", "model.onnx"], "give a new or empty folder"),
+        ([".modsoft-hil", "run.jsonl"], "give a new or empty folder"),
+    ],
+)
+def test_files_of_others_and_finished_reports_are_never_replaced(files, says, tmp_path, order):
+    before = {name: "old" for name in files}
+    for name in files:
+        (tmp_path / "out" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "out" / name).write_text("old")
-    with pytest.raises(UsageError, match="holds the report of a run already; give another --report"):
+    with pytest.raises(UsageError, match=says):
         order()
-    assert {path.name: path.read_text() for path in (tmp_path / "out").iterdir()} == {
-        report.FINISHED: "old",
-        "run.jsonl": "old",
-    }
+    assert texts(tmp_path / "out") == before
 
 
-def test_an_interrupted_run_leaves_its_own_traces_and_no_report(tmp_path, order):
-    """And what an earlier interrupted one left is gone; what is none of its own stays."""
-    (tmp_path / "out" / "runs" / "0-down").mkdir(parents=True)
-    for name in ("plant.jsonl", "report.md", "mine.txt", "runs/0-down/run.jsonl"):
-        (tmp_path / "out" / name).write_text("old")
+def test_an_interrupted_run_leaves_its_traces_and_the_next_one_replaces_them(tmp_path, order):
+    """And nothing else that is in the folder."""
+    for _ in range(2):
+        with pytest.raises((KeyboardInterrupt, click.Abort)):
+            order()
+        own = {name: "new" for name in ("board.jsonl", "run.jsonl", "meta.json")}
+        own[".modsoft-hil"] = report_folder.MARKER_TEXT
+        assert texts(tmp_path / "out") == own
+        (tmp_path / "out" / "plant.jsonl").write_text("of the interrupted run")
+        (tmp_path / "out" / "runtime-log-0" / "1-down").mkdir(parents=True)
+    for name in ("mine.txt", "runs/1-down/run.jsonl"):
+        (tmp_path / "out" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "out" / name).write_text("mine")
     with pytest.raises((KeyboardInterrupt, click.Abort)):
         order()
-    assert {path.name: path.read_text() for path in (tmp_path / "out").iterdir()} == {
-        "board.jsonl": "new",
-        "run.jsonl": "new",
-        "meta.json": "new",
-        "mine.txt": "old",
-    }
+    assert texts(tmp_path / "out") == {**own, "mine.txt": "mine", "runs/1-down/run.jsonl": "mine"}
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path, order):
+    with report_folder.claimed(tmp_path / "out"), pytest.raises(InUse, match="another modsoft-hil writes to it"):
+        order()
 
 
 def test_a_folder_that_cannot_be_made_is_told(tmp_path, order):

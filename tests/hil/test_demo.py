@@ -75,6 +75,36 @@ def test_leftovers_of_another_order_are_cleared_away(demo):
     assert not (demo.FOLDER / "result.resume").exists()
 
 
+@pytest.mark.parametrize("name", ["result", "result.parts"])
+def test_files_that_the_demo_did_not_make_stay(demo, name, capsys):
+    (demo.FOLDER / name).write_text("mine")
+    assert demo.make(stage(demo), "[1/1]") == 2
+    assert capsys.readouterr().err == f"demo: demo/{name}: not made by the demo; move it elsewhere\n"
+    assert (demo.FOLDER / name).read_text() == "mine"
+    assert demo.ran == []
+
+
+def test_another_order_leaves_files_with_similar_names(demo):
+    demo.make(stage(demo), "[1/1]")
+    (demo.FOLDER / "result.old").write_text("mine")
+    demo.make(stage(demo, "--more"), "[1/1]")
+    assert (demo.FOLDER / "result.old").read_text() == "mine"
+
+
+def test_only_a_report_of_the_rig_is_replaced(demo, monkeypatch, capsys):
+    """The demo changes to its own folder first; here it stays in this one."""
+    monkeypatch.setattr(demo, "ROOT", Path.cwd())
+    monkeypatch.setattr(demo, "STAGES", [])
+    demo.REPORT.mkdir()
+    (demo.REPORT / "report.json").write_text("mine")
+    assert demo.main() == 2
+    assert "demo/report" in capsys.readouterr().err
+    assert (demo.REPORT / "report.json").read_text() == "mine"
+    (demo.REPORT / ".modsoft-hil").write_text(demo.report_folder.MARKER_TEXT)
+    demo.report_folder.drop_report(demo.REPORT)
+    assert not (demo.REPORT / "report.json").exists()
+
+
 def test_a_failed_stage_is_made_again(demo):
     demo.exit_code = 65
     assert demo.make(stage(demo), "[1/1]") == 65

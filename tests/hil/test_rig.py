@@ -85,7 +85,7 @@ def test_a_model_of_three_modules_runs_robots_of_three_and_two(robot, strong_mod
     assert verdict.word == "not judged", table
     if "too slow" not in verdict.reason:
         assert all(line.ok for line in verdict.acceptances), table
-        off = angle_between_deg(found.configuration, as_in_collection(found, next(tmp_path.glob("runs/*"))))
+        off = angle_between_deg(found.configuration, as_in_collection(found, next(tmp_path.glob("runtime-log-*/*"))))
         print(f"off the robot of the training data, same actuation: mean {off.mean():.3f}, max {off.max():.2f}°")
         assert off.mean() < 0.3, "the rig's robot is not the one that the controller was trained on"
 
@@ -117,7 +117,7 @@ def test_a_killed_runtime_leaves_every_valve_at_0_within_700_ms(strong_model, tm
 
 def ticked(folder):
     """Whether a run that logs below `folder` has begun."""
-    return any(b'\n{"tick"' in log.read_bytes() for log in folder.glob("runs/*/run.jsonl"))
+    return any(b'\n{"tick"' in log.read_bytes() for log in folder.glob("runtime-log-*/*/run.jsonl"))
 
 
 def rig_command(folder, model):
@@ -129,13 +129,14 @@ def rig_command(folder, model):
 @pytest.mark.realtime
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 def test_nothing_outlives_the_rig(number, code, model_file, tmp_path):
+    out = tmp_path / "out"
     temporary = {"TMPDIR": str(tmp_path)}  # a killed process leaves its temporary folders
     with subprocess.Popen(
-        rig_command(tmp_path, model_file), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        rig_command(out, model_file), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
         env={**os.environ, **temporary},
     ) as process:  # fmt: skip
         try:
-            wait_until(lambda: ticked(tmp_path) or process.poll() is not None, 30)
+            wait_until(lambda: ticked(out) or process.poll() is not None, 30)
             assert process.poll() is None
             below = descendants(process.pid)
             assert len(below) >= 4, "board, tracker, robot, runtime"
@@ -146,7 +147,7 @@ def test_nothing_outlives_the_rig(number, code, model_file, tmp_path):
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
     if number != signal.SIGKILL:  # a killed rig has not written all that it knew
-        duties = record.valves(record.lines(tmp_path / "board.jsonl")).duty
+        duties = record.valves(record.lines(out / "board.jsonl")).duty
         assert duties.any()
         assert not duties[-1].any(), "the runtime is given the time to vent"
 

@@ -118,8 +118,10 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
 def test_a_finished_model_is_kept_and_of_another_run_refused(tmp_path):
     out = tmp_path / "model.pt"
     made, told = train.train([make()], out, SMALL), []
-    before = out.read_bytes()
+    before, other = out.read_bytes(), tmp_path / "model.pt.resume"
+    other.write_text("not of this training")
     again = train.train([make()], out, SMALL, told.append)
+    assert other.read_text() == "not of this training"
     assert equal(again["weights"], made["weights"])
     assert not told
     with pytest.raises(ModelError, match=r"there already, made with batch 32, asked for 64; give another --out"):

@@ -7,20 +7,19 @@ import shutil
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from modsoft.runtime.command import entry
 from modsoft.runtime.controller import Controller
-from modsoft.runtime.errors import OutputError, UsageError
 from modsoft.runtime.trajectory import load_task
+
+if TYPE_CHECKING:
+    from modsoft.hil.rig import Rig
 
 RUN_SLACK_S = 60.0  # start, arming, venting and closing of the runtime, beyond its ticks
 AFTER_S = 1.5  # the trace goes on for so long, until the chambers are empty
-RUNS = "runs"  # the rig's folder for the runtime's logs
-RUN_FILES = ("run.jsonl", "meta.json")  # of such a log
-WRITTEN = (*RUN_FILES, "board.jsonl", "plant.jsonl", "runtime.out", "runtime.err", "report.md", "report.json",
-           "angles.png")  # fmt: skip
 
 
 @click.command("modsoft-hil", context_settings={"show_default": True})
@@ -28,7 +27,7 @@ WRITTEN = (*RUN_FILES, "board.jsonl", "plant.jsonl", "runtime.out", "runtime.err
 @click.option("--model", required=True, type=click.Path(path_type=Path), help="Controller of modsoft-export.")
 @click.option("--task", required=True, help="Task's name (edge, down), or a .npy file of desired configurations.")
 @click.option("--report", required=True, type=click.Path(path_type=Path, file_okay=False),
-              help="Folder to write; one that holds a report already is refused.")  # fmt: skip
+              help="Folder to write, new or empty; one that holds a report already is refused.")  # fmt: skip
 @click.option("--board", default="auto", type=click.Choice(["auto", "simavr", "native"]),
               help="simavr: the compiled firmware on an emulated ATmega2560. native: its logic compiled for this "
                    "machine. auto: simavr where it can be had.")  # fmt: skip
@@ -53,14 +52,13 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     """
     from tqdm import tqdm
 
-    from modsoft.hil import judge, record  # after --help: matplotlib takes a second to import
+    from modsoft.hil import judge, record, report_folder  # after --help: matplotlib takes a second to import
     from modsoft.hil import report as reports
     from modsoft.hil.emulator import build, choose
     from modsoft.hil.plant import load_robot
     from modsoft.hil.rig import Rig
 
-    if (report / reports.FINISHED).exists():
-        raise UsageError(f"{report}: holds the report of a run already; give another --report, or delete it")
+    report_folder.check(report)
     robot = load_robot(robot_file)
     desired = load_task(task, robot)
     Controller.load(model).check(robot)  # the runtime does it too; here it saves the start of the rig
@@ -68,18 +66,17 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     count = len(asked)
     build(choose(board))
 
-    _clear(report)
     options = [] if steps is None else ["--steps", str(steps)]
-    rig = Rig(robot_file, report, board)
-    try:
-        with rig:
-            rig.run(model, task, *options)
-            with tqdm(total=count, unit=" ticks", desc="run", disable=not sys.stderr.isatty()) as bar:
-                rig.wait(count * robot.loop.period_s + RUN_SLACK_S, lambda ticks: bar.update(ticks - bar.n))
-            rig.settle(AFTER_S)
-    finally:
-        ran = _move_log(rig.run_folder(), report)
-        shutil.rmtree(report / RUNS, ignore_errors=True)
+    with report_folder.claimed(report):
+        rig = Rig(robot_file, report, board)
+        try:
+            with rig:
+                rig.run(model, task, *options)
+                with tqdm(total=count, unit=" ticks", desc="run", disable=not sys.stderr.isatty()) as bar:
+                    rig.wait(count * robot.loop.period_s + RUN_SLACK_S, lambda ticks: bar.update(ticks - bar.n))
+                rig.settle(AFTER_S)
+        finally:
+            ran = _move_log(rig, report)
     found = record.read(report, report if ran else None, robot, task, asked, rig.runtime.returncode)
     verdict = judge.judge(found)
     about = {
@@ -103,24 +100,17 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     return found.runtime_exit if found.runtime_exit and not len(found.tick) else verdict.exit_code
 
 
-def _clear(report: Path) -> None:
-    """Makes the folder; whatever is found there afterwards is of this run."""
-    try:
-        report.mkdir(parents=True, exist_ok=True)
-        for name in WRITTEN:
-            (report / name).unlink(missing_ok=True)
-        shutil.rmtree(report / RUNS, ignore_errors=True)
-    except OSError as error:
-        raise OutputError(f"{report}: cannot be written ({error.strerror}); choose another --report") from error
+def _move_log(rig: Rig, report: Path) -> bool:
+    """Moves the runtime's log beside the other traces and deletes its folder; returns whether there was a log."""
+    from modsoft.hil.report_folder import RUN_FILES
 
-
-def _move_log(run: Path | None, report: Path) -> bool:
-    """Moves the runtime's log beside the other traces; whether there was one."""
-    if run is None:
-        return False
-    for name in RUN_FILES:
-        shutil.move(run / name, report / name)
-    return True
+    run = rig.run_folder()
+    if run is not None:
+        for name in RUN_FILES:
+            shutil.move(run / name, report / name)
+    if rig.runs is not None:
+        shutil.rmtree(rig.runs, ignore_errors=True)
+    return run is not None
 
 
 main = entry(cli)

@@ -39,6 +39,7 @@ import click
 
 from modsoft.hil.polaris_device import Polaris
 from modsoft.runtime.command import entry
+from modsoft.runtime.errors import UsageError
 
 SECONDS_A_BYTE = 10 / 115200
 
@@ -51,6 +52,8 @@ class Line:
         self.plug()
 
     def plug(self) -> None:
+        if self.link.exists() and not self.link.is_symlink():
+            raise UsageError(f"{self.link}: exists and is no link; give another --link")
         self.master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self.master, False)

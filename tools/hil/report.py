@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 
 from modsoft.hil.judge import Acceptance, Verdict, measured_off_deg, tracking_error_deg
 from modsoft.hil.record import Record
+from modsoft.hil.report_folder import FINISHED
 from modsoft.hil.valves import valve_difference
 from modsoft.runtime.configuration import angle_between_deg, bending_angle_deg
 from modsoft.runtime.files import written
 from modsoft.runtime.tally import spread
 
-FINISHED = "report.json"
 CLOCKS = (
     "Tick lateness and acknowledgement times: the host's CLOCK_MONOTONIC, taken by modsoft-runtime. Valve outputs: the "
     "emulated board's timer registers (native board: what its logic asks for), stamped with its cycle counter and, for "

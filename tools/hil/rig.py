@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -27,6 +26,7 @@ from typing import IO, Any, cast
 from modsoft.hil.emulator import EmulatedBoard, end
 from modsoft.hil.plant import load_robot
 from modsoft.hil.polaris import write_tool_files
+from modsoft.hil.report_folder import LOG_PREFIX
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, UsageError
 
 Line = dict[str, Any]
@@ -111,7 +111,7 @@ class Rig:
         self.robot = load_robot(robot_file)
         self._robot_file = str(Path(robot_file).resolve() if Path(robot_file).is_file() else robot_file)
         self.folder = folder
-        self.runs = folder / "runs"
+        self.runs: Path | None = None  # where the latest runtime logs
         self.board = EmulatedBoard(board, on_event=self._board_event)
         self.plant: Child
         self.tracker: Child
@@ -156,15 +156,18 @@ class Rig:
     def tracker_port(self) -> str:
         return str(self._ports / "ttyPolaris")
 
-    def run(self, model: str | Path, task: str, *options: str) -> subprocess.Popen[bytes]:
+    def run(
+        self, model: str | Path, task: str, *options: str, runs: Path | None = None
+    ) -> subprocess.Popen[bytes]:
         """Starts modsoft-runtime, unmodified, as anybody would: its console script, beside this interpreter.
 
-        Its log goes to a folder in `runs`, what it says to runtime.out and runtime.err. Further options are passed on.
+        Its log goes to a folder in `runs` (None: a new folder in the rig's own), what it says to runtime.out and
+        runtime.err. Further options are passed on.
         """
         script = Path(sys.executable).parent / "modsoft-runtime"
         if not script.is_file():
             raise UsageError(f"no {script.name} beside {Path(sys.executable).name}: pip install modsoft there first")
-        shutil.rmtree(self.runs, ignore_errors=True)
+        self.runs = runs or Path(tempfile.mkdtemp(prefix=LOG_PREFIX, dir=self.folder))
         tools = [option for path in self.tool_files for option in ("--tool", str(path))]
         command = [
             str(script), "--yes", "--robot", self._robot_file, "--model", str(model), "--task", task,
@@ -202,7 +205,7 @@ class Rig:
 
     def run_folder(self) -> Path | None:
         """Where the runtime logs, as soon as it does."""
-        found = sorted(self.runs.glob("*/run.jsonl"))
+        found = sorted(self.runs.glob("*/run.jsonl")) if self.runs else []
         return found[-1].parent if found else None
 
     def ticks(self) -> int:

@@ -78,9 +78,8 @@ class Soak:
         """Until a fault ends it; returns what was injected."""
         rig = self.rig
         self.runs.append(ran)
-        rig.runs = self.folder / f"run-{ran.number:03}"
         board_began, plant_began, began_s = len(rig.board.trace), len(rig.plant_states), time.monotonic()
-        process = rig.run(self.model, str(self._task))
+        process = rig.run(self.model, str(self._task), runs=self.folder / f"run-{ran.number:03}")
         injected: list[Injected] = []
         with self._log(process) as log:
             while log is not None and process.poll() is None and time.monotonic() < self._end_s:
@@ -171,7 +170,9 @@ class Soak:
         self, ran: Ran, injected: list[Injected], by_itself: bool, board_began: int, plant_began: int
     ) -> None:
         """Makes the run's folder whole, and checks it."""
-        rig, folder, run = self.rig, self.rig.runs, self.rig.run_folder()
+        rig, run = self.rig, self.rig.run_folder()
+        assert rig.runs is not None
+        folder = rig.runs
         folder.mkdir(parents=True, exist_ok=True)
         events = list(rig.board.trace[board_began:])
         _keep(folder / "board.jsonl", [rig.board.ready, *events])

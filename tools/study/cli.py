@@ -43,6 +43,7 @@ def study(out: Path, jobs: int | None, quick: bool, only: str | None) -> None:
     from modsoft.training.backends import cores
 
     asked, folder, processes = plan.quick() if quick else plan.full(), Folder(out), jobs or cores()
+    folder.check_own()
     folder.make()
     makers = (making.collecting, making.training, making.exporting, making.estimating, flights.flying, floors.finding)
     writers: dict[str, Callable[[], None]] = {
@@ -86,6 +87,7 @@ def write_report(folder: Path, to: Path | None) -> None:
     from modsoft.study.folder import Folder
 
     written = Folder(folder if to is None else to)
+    written.check_own()
     if to is not None:
         report.publish(Folder(folder), written)
     report.write(written)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 import zlib
 from pathlib import Path
 
-from modsoft.runtime.errors import OutputError
+from modsoft.runtime.errors import OutputError, UsageError
 from modsoft.study.plan import Model, Run
 
 # What numpy raises for a file of arrays that is none, or damaged.
@@ -22,6 +23,17 @@ class Folder:
         self.report = out / "report.md"
         self.notes = out / "notes.md"  # written by people; the report ends with it
         self.figures = out / "figures"
+
+    def check_own(self) -> None:
+        """`UsageError` where files have the names of a study's results and a study did not write them."""
+        names = (self.report, self.results, *sorted(self.figures.glob("figure-*.png")))
+        written = [path for path in names if path.exists()]
+        try:
+            is_study = {"about", "records"} <= json.loads(self.results.read_bytes()).keys()
+        except (OSError, ValueError, AttributeError):
+            is_study = False
+        if written and not is_study:
+            raise UsageError(f"{written[0]}: not written by a study, which would replace it; choose another folder")
 
     def make(self) -> None:
         for name in ("data", "models", "estimates", "runs", "floors", "figures"):

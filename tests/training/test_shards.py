@@ -1,0 +1,43 @@
+"""The folder of finished episodes: a collection deletes only what a collection wrote."""
+
+import numpy as np
+import pytest
+
+from modsoft.runtime.errors import ModelError
+from modsoft.training.dataset import Episode
+from modsoft.training.shards import Shards
+
+EPISODE = Episode(np.zeros((2, 3, 3)), np.zeros((1, 3, 1)), 0)
+
+
+@pytest.fixture
+def shards(tmp_path):
+    (tmp_path / "d.h5.parts").mkdir()
+    return Shards(tmp_path / "d.h5.parts")
+
+
+def test_files_of_others_survive_the_end_of_a_collection(shards):
+    for name in ("notes.txt", ".draft.tmp", "episode-1.npz"):
+        (shards.folder / name).write_text("mine")
+    with shards.held():
+        shards.open({"seed": 1})
+        shards.write(0, EPISODE)
+        (shards.folder / ".episode-000001.npz.host.1.tmp").write_text("of a killed worker")
+        shards.remove()
+    left = {path.name: path.read_text() for path in shards.folder.iterdir()}
+    assert left == dict.fromkeys(("notes.txt", ".draft.tmp", "episode-1.npz"), "mine")
+
+
+def test_a_folder_without_other_files_is_deleted(shards):
+    with shards.held():
+        shards.open({"seed": 1})
+        shards.write(0, EPISODE)
+        shards.remove()
+    assert list(shards.folder.parent.iterdir()) == []
+
+
+def test_episodes_without_a_recipe_are_not_those_of_a_collection(shards):
+    (shards.folder / "episode-000000.npz").write_text("mine")
+    with shards.held(), pytest.raises(ModelError, match="episodes without the recipe of modsoft-collect"):
+        shards.open({"seed": 1})
+    assert (shards.folder / "episode-000000.npz").read_text() == "mine"
