@@ -135,7 +135,7 @@ def collect(
     if out.exists() and not shards.folder.exists():
         _sweep(out)
         return _finished(out, recipe, count)
-    with BACKENDS[backend](jobs, shards.folder, options or {}) as deal, shards.held():
+    with BACKENDS[backend](jobs, shards.folder, options or {}) as deal, shards.held(out):
         _sweep(out)
         if out.exists():  # killed between the last two lines below, or another collection has just made it
             header = _finished(out, recipe, count)

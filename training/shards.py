@@ -7,23 +7,22 @@ out the work, joins and clears away.
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
 import os
 import re
 import shutil
 import socket
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
-from modsoft.runtime.errors import InUse, ModelError, OutputError
+from modsoft.runtime.errors import ModelError, OutputError
 from modsoft.runtime.files import NOT_AN_ARRAY, written
+from modsoft.runtime.locks import locked
 from modsoft.training.dataset import Episode
 
 EPISODE = re.compile(r"episode-([0-9]{6}|[1-9][0-9]{6,8})\.npz")
@@ -37,44 +36,22 @@ class Shards:
 
     folder: Path
 
-    @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """The folder, made where it is not there, for this collection alone; `InUse` while another one has it. The
-        system lets go of it when the process ends, however it ends."""
-        while True:
-            with self._opened_lock() as lock:
-                self._lock(lock.fileno())
-                if self._is_there(lock.fileno()):
-                    yield
-                    return  # else another one was done with the folder meanwhile, and took it away
+    def held(self, out: Path) -> AbstractContextManager[None]:
+        """The folder and the data set `out` for this collection alone; `InUse` while another one has them."""
+        return locked(out.with_name(f"{out.name}.lock"), out, "modsoft-collect")
 
-    def _opened_lock(self) -> IO[bytes]:
-        for path in (self.folder, self.folder / "lock"):
-            if path.is_symlink():  # it would be cleared away, or written to, wherever it is
-                raise ModelError(f"{path}: a link, expected what modsoft-collect makes; choose another --out")
-        try:
-            self.folder.mkdir(exist_ok=True)
-            return open(self.folder / "lock", "wb", opener=_own)
-        except OSError as error:
-            raise OutputError(f"{self.folder}: cannot be made ({error.strerror}); choose another --out") from error
-
-    def _lock(self, descriptor: int) -> None:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InUse(f"{self.folder}: another modsoft-collect works on it; wait for it, or stop it") from error
-        except OSError:
-            pass  # a file system without locks
-
-    def _is_there(self, descriptor: int) -> bool:
-        """Whether the open lock is the one in the folder."""
-        try:
-            return os.path.samestat(os.fstat(descriptor), os.stat(self.folder / "lock"))
-        except FileNotFoundError:
-            return False
+    def refuse_link(self) -> None:
+        """`ModelError` where the folder is a link: it would be cleared away, or written to, wherever it is."""
+        if self.folder.is_symlink():
+            raise ModelError(f"{self.folder}: a link, expected what modsoft-collect makes; choose another --out")
 
     def open(self, recipe: dict[str, Any]) -> None:
         """Begins in the folder, or checks that what is there belongs to the same recipe (`ModelError`)."""
+        self.refuse_link()
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.folder}: cannot be made ({error.strerror}); choose another --out") from error
         for stale in self.folder.iterdir():
             if STALE.fullmatch(stale.name):  # of a process that was killed while it wrote
                 self._drop(stale)
@@ -137,6 +114,7 @@ class Shards:
     def remove(self) -> None:
         """Takes the folder away at one stroke; a worker still at work for a killed collection finds it gone. Where
         others put files there, it deletes what a collection wrote and leaves the rest."""
+        self.refuse_link()
         if not self.folder.exists():
             return
         own = [path for path in self.folder.iterdir() if _is_own(path.name)]
@@ -151,11 +129,6 @@ class Shards:
 
 def _is_own(name: str) -> bool:
     return name in ("lock", "recipe.json") or any(each.fullmatch(name) for each in (EPISODE, STALE, JOBS))
-
-
-def _own(path: str, flags: int) -> int:
-    """Opens a file, but no link, which might name any file of the user's."""
-    return os.open(path, flags & ~os.O_TRUNC | os.O_NOFOLLOW, 0o666)
 
 
 def refuse_other(found: dict[str, Any], recipe: dict[str, Any], where: Path) -> None:

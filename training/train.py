@@ -23,6 +23,7 @@ import torch
 from modsoft.runtime.configuration import feature_names, labels
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.files import check_writable
+from modsoft.runtime.locks import locked
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import networks
 from modsoft.training.dataset import DataSet, Windows, split
@@ -115,7 +116,19 @@ def train(
     """Trains on all windows of the data sets, which are of one robot, writes the checkpoint `out` and gives it. Each
     data set is split on its own. Where `out` is there already of the same data and settings it
     is given as it is, and a run goes on from `out.resume`; either of others is refused. Sets torch's threads and random
-    state for the whole process."""
+    state for the whole process. `InUse` while another process trains `out`."""
+    check_writable(out)
+    with locked(out.with_name(f"{out.name}.lock"), out, "modsoft-train"):
+        return _train(data, out, settings, progress, clock)
+
+
+def _train(
+    data: Sequence[DataSet],
+    out: Path,
+    settings: Settings,
+    progress: Callable[[Progress], None],
+    clock: Callable[[], float],
+) -> dict[str, Any]:
     torch.set_num_threads(settings.threads)
     torch.manual_seed(settings.seed)
     robot = _robot(data)
@@ -136,7 +149,6 @@ def train(
     network = networks.build(described)
     identity = {"data_sha256": data_sha256(data), **asdict(settings)}
     resume = out.with_name(f"{out.name}.resume")
-    check_writable(out)
     if out.exists():
         made = _finished(out, identity)
         with contextlib.suppress(ModelError):  # a file that this training did not write

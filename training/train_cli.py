@@ -59,8 +59,9 @@ def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
       modsoft-train dataset.h5 --out model.pt
       modsoft-train staged.h5 smooth.h5 --out model.pt
 
-    Stopped or killed, the same command goes on from OUT.resume and ends with the same model. At the end it prints
-    how far off the estimated actuation is on data never used, in percent of the actuation range.
+    Stopped or killed, the same command goes on from OUT.resume and ends with the same model. While one works on OUT,
+    another ends with 75. At the end it prints how far off the estimated actuation is on data never used, in percent of
+    the actuation range.
     """
     for name, value in options.items():
         if isinstance(value, float) and not math.isfinite(value):

@@ -70,7 +70,7 @@ def test_an_odd_episode_is_made_again(tmp_path, parts, attack):
     assert dataset.read(tmp_path / "d.h5").samples == 20
 
 
-@pytest.mark.parametrize("name", ["episode-000000.npz", ".x.tmp"])
+@pytest.mark.parametrize("name", ["episode-000000.npz", ".episode-000000.npz.x.tmp"])
 def test_a_folder_in_the_place_of_a_file_is_told(tmp_path, parts, name):
     (parts / name).mkdir()
     with pytest.raises(OutputError, match=f"{name}: no whole episode, and cannot be deleted"):
@@ -106,10 +106,12 @@ def test_results_of_jobs_that_were_there_before_are_not_unpickled(tmp_path, part
 
 
 def test_links_are_not_followed(tmp_path, parts, private, refused):
-    for name in ("episode-000000.npz", "lock", ".episode-000000.npz.here.1.tmp"):
+    for name in ("episode-000000.npz", ".episode-000000.npz.here.1.tmp"):
         (parts / name).symlink_to(private)
-    refused(collected, tmp_path / "d.h5", "lock: a link")
-    (parts / "lock").unlink()
+    (tmp_path / "d.h5.lock").symlink_to(private)
+    with pytest.raises(OutputError, match=r"d\.h5\.lock: cannot be made \(a link"):
+        collected(tmp_path / "d.h5")
+    (tmp_path / "d.h5.lock").unlink()
     collected(tmp_path / "d.h5")
     assert private.read_text() == "mine"
 
@@ -139,41 +141,12 @@ def test_a_recipe_that_is_none(tmp_path, parts, recipe, refused):
 
 # ---- Two at a time --------------------------------------------------------------------------------------------------
 
-HOLDS = """
-import sys
-from pathlib import Path
-from modsoft.training.shards import Shards
-with Shards(Path(sys.argv[1])).held():
-    print("held", flush=True)
-    sys.stdin.read()
-"""
-
-
 def test_two_collections_do_not_work_on_the_same_data_set(tmp_path, parts):
-    command = [sys.executable, "-c", HOLDS, str(parts)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout.readline() == "held\n"
-        with pytest.raises(InUse, match=r"d\.h5\.parts: another modsoft-collect works on it") as told:
+    with Shards(parts).held(tmp_path / "d.h5"):
+        with pytest.raises(InUse, match=r"d\.h5: another modsoft-collect works on it") as refused:
             collected(tmp_path / "d.h5")
-        assert told.value.exit_code == 75
-        other.kill()  # nothing of a killed one is in the way
+        assert refused.value.exit_code == 75
     assert collected(tmp_path / "d.h5").samples == 20
-
-
-def test_a_folder_that_another_collection_took_away_meanwhile_is_made_anew(tmp_path, parts, monkeypatch):
-    shards, taken = Shards(parts), []
-    lock = Shards._lock
-
-    def too_late(self, descriptor):
-        if not taken:
-            taken.append(shards.remove())
-        lock(self, descriptor)
-
-    monkeypatch.setattr(Shards, "_lock", too_late)
-    with shards.held():
-        assert [path.name for path in parts.iterdir()] == ["lock"]
-        with pytest.raises(InUse), Shards(parts).held():
-            pass
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ def shards(tmp_path):
 def test_files_of_others_survive_the_end_of_a_collection(shards):
     for name in ("notes.txt", ".draft.tmp", "episode-1.npz"):
         (shards.folder / name).write_text("mine")
-    with shards.held():
+    with shards.held(shards.folder.with_name("d.h5")):
         shards.open({"seed": 1})
         shards.write(0, EPISODE)
         (shards.folder / ".episode-000001.npz.host.1.tmp").write_text("of a killed worker")
@@ -29,7 +29,7 @@ def test_files_of_others_survive_the_end_of_a_collection(shards):
 
 
 def test_a_folder_without_other_files_is_deleted(shards):
-    with shards.held():
+    with shards.held(shards.folder.with_name("d.h5")):
         shards.open({"seed": 1})
         shards.write(0, EPISODE)
         shards.remove()
@@ -38,6 +38,6 @@ def test_a_folder_without_other_files_is_deleted(shards):
 
 def test_episodes_without_a_recipe_are_not_those_of_a_collection(shards):
     (shards.folder / "episode-000000.npz").write_text("mine")
-    with shards.held(), pytest.raises(ModelError, match="episodes without the recipe of modsoft-collect"):
+    with pytest.raises(ModelError, match="episodes without the recipe of modsoft-collect"):
         shards.open({"seed": 1})
     assert (shards.folder / "episode-000000.npz").read_text() == "mine"

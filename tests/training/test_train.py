@@ -9,7 +9,7 @@ import torch
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import feature_names, from_angles_deg
-from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.runtime.errors import InUse, ModelError, UsageError
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import dataset, train
 
@@ -135,6 +135,21 @@ def test_a_run_that_diverged_leaves_nothing_to_go_on_from(tmp_path, monkeypatch,
     with pytest.raises(ModelError, match="diverged"):
         train.train([make()], tmp_path / "model.pt", SMALL)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_second_training_of_the_same_model_is_refused_and_changes_nothing(tmp_path):
+    out, refused = tmp_path / "model.pt", []
+
+    def second(now):
+        if now.iteration == 5:
+            with pytest.raises(InUse, match="another modsoft-train works on it") as error:
+                train.train([make()], out, dataclasses.replace(SMALL, seed=2))
+            refused.append(error.value.exit_code)
+
+    train.train([make()], out, SMALL, second)
+    assert refused == [75]
+    assert checkpoints.load(out)["provenance"]["seed"] == SMALL.seed
+    assert list(tmp_path.iterdir()) == [out]
 
 
 class Cut(Exception):

@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from modsoft.runtime.command import entry
+from modsoft.runtime.locks import locked
 
 STAGES = ("collect", "train", "export", "estimate", "fly", "floors", "measure", "figures", "report")
 
@@ -52,17 +53,19 @@ def study(out: Path, jobs: int | None, quick: bool, only: str | None) -> None:
         "report": lambda: report.write(folder),
     }
     began_s = time.monotonic()
-    if only is None:
-        expected = [make(asked, folder, processes) for make in makers]
-        told = ", ".join(f"{stage.name} {_minutes(stage.expected_s(processes))}" for stage in expected)
-        whole = _minutes(sum(stage.expected_s(processes) for stage in expected))
-        click.echo(f"{out}: about {whole} to go with {processes} processes on as many free cores ({told})", err=True)
-    for name, make in zip(STAGES, makers, strict=False):
-        if only in (None, name):
-            make(asked, folder, processes).run(processes)  # asked again: what is left depends on the stages before
-    for name, write in writers.items():
-        if only in (None, name):
-            write()
+    with locked(out / "study.lock", out, "modsoft-evaluate study"):
+        if only is None:
+            expected = [make(asked, folder, processes) for make in makers]
+            told = ", ".join(f"{stage.name} {_minutes(stage.expected_s(processes))}" for stage in expected)
+            whole = _minutes(sum(stage.expected_s(processes) for stage in expected))
+            where = f"with {processes} processes on as many free cores"
+            click.echo(f"{out}: about {whole} to go {where} ({told})", err=True)
+        for name, make in zip(STAGES, makers, strict=False):
+            if only in (None, name):
+                make(asked, folder, processes).run(processes)  # asked again: what is left depends on the stages before
+        for name, write in writers.items():
+            if only in (None, name):
+                write()
     click.echo(f"{folder.report if only is None else only}: {_minutes(time.monotonic() - began_s)}")
 
 

@@ -1,0 +1,110 @@
+"""One process at a time on an output; a lock that a killed process left blocks nothing."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from modsoft.runtime import locks
+from modsoft.runtime.errors import InUse, OutputError
+from modsoft.runtime.locks import locked
+
+HOLD = """
+import sys
+from pathlib import Path
+from modsoft.runtime.locks import locked
+with locked(Path(sys.argv[1]), Path("out"), "command"):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def held(lock):
+    return locked(lock, Path("out"), "command")
+
+
+def test_another_process_is_refused_until_the_first_is_gone(tmp_path):
+    lock = tmp_path / "out.lock"
+    command = [sys.executable, "-c", HOLD, str(lock)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(InUse, match="out: another command works on it") as refused, held(lock):
+            pass
+        assert refused.value.exit_code == 75
+        assert lock.exists(), "the refused one must not delete it"
+        other.kill()
+    assert lock.exists(), "a killed process leaves its file"
+    with held(lock):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_that_was_deleted_while_it_was_opened_is_made_again(tmp_path, monkeypatch):
+    lock, deleted, take = tmp_path / "out.lock", [], locks._take
+
+    def too_late(descriptor):
+        if not deleted:
+            deleted.append(lock.unlink())
+        return take(descriptor)
+
+    monkeypatch.setattr(locks, "_take", too_late)
+    with held(lock):
+        assert lock.exists()
+        with pytest.raises(InUse), held(lock):
+            pass
+
+
+def test_an_error_in_the_work_releases_it(tmp_path):
+    with pytest.raises(ZeroDivisionError), held(tmp_path / "out.lock"):
+        raise ZeroDivisionError
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_of_somebody_else_keeps_its_content(tmp_path):
+    (tmp_path / "out.lock").write_text("mine")
+    with held(tmp_path / "out.lock"):
+        pass
+    assert (tmp_path / "out.lock").read_text() == "mine"
+
+
+@pytest.mark.parametrize("kind", ["link", "folder", "no folder"])
+def test_what_cannot_be_a_lock_is_one_line(tmp_path, kind):
+    lock, private = tmp_path / "out.lock", tmp_path / "private"
+    if kind == "link":
+        lock.symlink_to(private)
+    elif kind == "folder":
+        lock.mkdir()
+    else:
+        lock = tmp_path / "absent" / "out.lock"
+    with pytest.raises(OutputError, match=r"out\.lock: cannot be made [^\n]*$"), held(lock):
+        pass
+    assert not private.exists()
+
+
+def test_without_fcntl_it_locks_as_windows_does(tmp_path, monkeypatch):
+    """The system's own function is replaced: what is tested is how it is called and what its errors mean."""
+    calls = []
+
+    def locking(descriptor, mode, size):
+        calls.append((os.fstat(descriptor).st_size, mode, size))
+        if len(calls) > 1:
+            raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(locks, "fcntl", None)
+    monkeypatch.setattr(locks, "msvcrt", SimpleNamespace(LK_NBLCK=2, locking=locking))
+    with held(tmp_path / "out.lock"):
+        with pytest.raises(InUse), held(tmp_path / "out.lock"):
+            pass
+    assert calls == [(0, 2, 1)] * 2
+
+
+def test_a_file_system_without_locks_stops_nobody(tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr(locks, "fcntl", SimpleNamespace(LOCK_EX=2, LOCK_NB=4, flock=flock))
+    with held(tmp_path / "out.lock"):
+        pass
