@@ -46,13 +46,22 @@ def read(path: Path, meta: Path | None = None) -> dict[str, Any]:
     return found
 
 
-def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
+def files_of(meta: Path) -> list[Path]:
+    """What is read with --meta: that file, and the robot file that it names, if any."""
+    return [meta, meta.parent / _meta(meta).robot]
+
+
+def _meta(meta: Path) -> MetaFile:
     try:
-        said = msgspec.convert(tomllib.loads(meta.read_text(encoding="utf-8")), MetaFile)
+        return msgspec.convert(tomllib.loads(meta.read_text(encoding="utf-8")), MetaFile)
     except OSError as error:
         raise ModelError(f"{meta}: cannot be read ({error.strerror})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
         raise ModelError(f"{meta}: {error}; expected {UNTOLD}") from error
+
+
+def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
+    said = _meta(meta)
     weights = checkpoints.read(path)
     if not all(isinstance(value, torch.Tensor) for value in weights.values()):
         raise ModelError(f"{path}: a checkpoint that says all itself, expected a bare state dict; leave --meta out")
@@ -62,7 +71,7 @@ def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
     if missing:
         raise ModelError(f"{path}: no matrix {', '.join(missing)} in it, expected the state dict of the biLSTM")
     beside = meta.parent / said.robot
-    robot = robots.load(beside if beside.is_file() else said.robot)
+    robot = robots.load(beside) if beside.exists() else robots.shipped(said.robot)
     return {
         "schema": checkpoints.SCHEMA,
         "robot": robot.to_dict(),

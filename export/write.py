@@ -15,7 +15,7 @@ from modsoft.runtime import robot as robots
 from modsoft.runtime.artefact import Description, Golden, Network
 from modsoft.runtime.controller import Controller
 from modsoft.runtime.errors import ModelError, UsageError
-from modsoft.runtime.files import check_writable, written
+from modsoft.runtime.files import check_not_input, check_writable, written
 from modsoft.training import checkpoint as checkpoints
 
 GOLDEN_MODULES = (2, 4)  # where the network takes any number
@@ -39,10 +39,9 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
     model = Path(model)
     out = model.with_suffix(".onnx") if out is None else Path(out)
     check_writable(out)
-    if out.resolve() == model.resolve():
-        raise UsageError(f"--out {out}: that is the model to export; give it another name")
     if model.suffix == ".onnx":
         raise UsageError(f"{model}: is ONNX already; did you mean modsoft-export --inspect {model}?")
+    check_not_input(out, model, *([] if meta is None else source.files_of(Path(meta))))
     checkpoint = source.read(model, None if meta is None else Path(meta))
     network, sizes = checkpoints.network_of(checkpoint), source.network_of(checkpoint)
     expected = parity.reference(network, sizes)

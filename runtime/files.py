@@ -1,4 +1,5 @@
-"""What a command reads is a file; what it writes has its name only when whole, and never replaces what is no file."""
+"""Files that a command reads and writes: an output has its name only when it is whole, goes where a link leads, and
+never replaces an input or what is no regular file."""
 
 from __future__ import annotations
 
@@ -23,34 +24,66 @@ def check_is_file(path: Path, what: str, advice: str) -> None:
         raise ModelError(f"no {what} {path}; {advice}")
 
 
+def target_of(path: Path) -> Path:
+    """Where a file written as `path` goes: `path` itself, or what its links lead to, whether that exists or not."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
+
+
 def check_writable(path: Path) -> None:
-    """Says before any work is done that `path` cannot be written: `UsageError` where its folder is missing or it is
-    no regular file (a folder, a device), `OutputError` where the folder lets nobody write."""
-    if not path.parent.is_dir():
-        raise UsageError(f"no folder {path.parent} for {path.name}; make it first")
+    """Reports before any work is done that `path` cannot be written: `UsageError` where its folder is missing or it is
+    no regular file (a folder, a device), `OutputError` where the folder is read-only. Of a link its target counts."""
+    target = target_of(path)
+    name = str(path) if target == path else f"{path}, a link to {target}"
+    if target.is_symlink():
+        raise UsageError(f"{path}: a link that leads to itself; expected the name of a file to write")
     if path.exists() and not path.is_file():
         what = "a folder" if path.is_dir() else "a device or pipe"
-        raise UsageError(f"{path}: {what}; expected the name of a file to write")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise OutputError(f"{path}: not written, the folder {path.parent} is read-only; choose another --out")
+        raise UsageError(f"{name}: {what}; expected the name of a file to write")
+    if not target.parent.is_dir():
+        where = target.name if target == path else name
+        raise UsageError(f"no folder {target.parent} for {where}; make it first")
+    if not os.access(target.parent, os.W_OK | os.X_OK):
+        raise OutputError(f"{name}: not written, the folder {target.parent} is read-only; choose another --out")
+
+
+def check_not_input(out: Path, *inputs: Path) -> None:
+    """`UsageError` where writing `out` would replace one of the files that are read, under this or another name."""
+    for path in inputs:
+        with contextlib.suppress(OSError):  # a file that does not exist is reported where it is read
+            if os.path.samefile(out, path):
+                name = f"the input {path}" if out == path else f"the same file as the input {path}"
+                raise UsageError(f"{out}: {name}, which would be replaced; give the output another name")
+
+
+def make_folder(path: Path) -> None:
+    """Makes `path` and the folders above it where they are missing, through links. `OutputError` where it cannot."""
+    try:
+        Path(os.path.realpath(path)).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: no such folder can be made ({error.strerror}); choose another") from error
 
 
 @contextlib.contextmanager
-def written(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write to, which becomes `path` at the end; a kill or an error leaves what was there.
+def written(path: Path, through_links: bool = True) -> Iterator[Path]:
+    """A name to write to, which becomes `path` at the end; a kill or an error leaves what was there.
 
-    Raises what `check_writable` does, and `OutputError` for whatever the system says meanwhile (a full disk). The
-    name holds machine and process: several may write the same file to a shared folder.
+    Where `path` is a link, the link stays and its target is written, with the temporary file beside the target: a link
+    usually leads to another disk. Without `through_links`, for folders that others can write to, the link is replaced.
+
+    Raises what `check_writable` does, and `OutputError` for what the system reports meanwhile (a full disk). The
+    temporary name holds machine and process: several may write the same file to a shared folder.
     """
-    check_writable(path)
-    temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
+    if through_links or not path.is_symlink():
+        check_writable(path)
+    target = target_of(path) if through_links else path
+    temporary = target.with_name(f".{target.name}.{socket.gethostname()}.{os.getpid()}.tmp")
     try:
         yield temporary
-        os.replace(temporary, path)
+        os.replace(temporary, target)
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror or error}); make room or choose another --out"
         ) from error
     finally:
-        with contextlib.suppress(OSError):  # where that fails too, the first error is the one to tell
+        with contextlib.suppress(OSError):  # where that fails too, the first error is the one to report
             temporary.unlink(missing_ok=True)

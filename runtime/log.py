@@ -170,7 +170,7 @@ class RunLog:
 
 def _new_folder(runs: Path, name: str) -> Path:
     """Makes a folder that did not exist: two runs may start in the same second."""
-    runs.mkdir(parents=True, exist_ok=True)
+    Path(os.path.realpath(runs)).mkdir(parents=True, exist_ok=True)  # also where a link's target is missing
     for folder in (runs / name, *(runs / f"{name}-{again}" for again in range(2, 100))):
         try:
             folder.mkdir()

@@ -174,15 +174,20 @@ def load(file_or_name: str | Path) -> Robot:
         except (OSError, UnicodeDecodeError) as error:
             raise RobotFileError(f"{path}: cannot be read as UTF-8 text ({error})") from error
         return parse(text, str(path))
+    return shipped(str(file_or_name))
+
+
+def shipped(name: str) -> Robot:
+    """A shipped robot by its name, whatever files there are."""
     try:
-        text = text_of(str(file_or_name))
+        text = text_of(name)
     except RobotFileError:
         raise RobotFileError(
-            f"no robot file {str(file_or_name)!r} here, and no shipped robot of that name; give a file or one of "
+            f"no robot file {name!r} here, and no shipped robot of that name; give a file or one of "
             f"{', '.join(names())}, cable-N (modsoft-runtime --print-robot pneumatic-3 > robot.toml makes one to start "
             "from)"
         ) from None
-    return parse(text, str(file_or_name))
+    return parse(text, name)
 
 
 def parse(text: str, where: str = "robot file") -> Robot:

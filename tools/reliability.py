@@ -22,7 +22,7 @@ import click
 from modsoft.runtime import log
 from modsoft.runtime.command import entry
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import written
+from modsoft.runtime.files import check_not_input, written
 
 ROOT = Path(__file__).resolve().parents[1]
 Line = dict[str, Any]
@@ -190,6 +190,7 @@ def run_tests(lines: Path, full: bool) -> int:
 def cli(full: bool, lines: Path | None, out: Path) -> int:
     command = "tools/reliability.py --full" if full else "make reliability"
     code = 0
+    check_not_input(out, *([] if lines is None else [lines]))
     with tempfile.TemporaryDirectory() as folder:
         if lines is None:
             lines = Path(folder) / "lines.jsonl"

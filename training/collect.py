@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import check_writable
+from modsoft.runtime.files import check_writable, target_of
 from modsoft.runtime.robot import Robot
 from modsoft.training import dataset, plants
 from modsoft.training.actions import draw_actions, stage_borders
@@ -129,7 +129,7 @@ def collect(
         plant = plants.fastest(robot)
     count = -(-samples // steps)
     recipe = recipe_of(robot, strategy, seed, steps, plant.name)
-    out = out.absolute()  # workers may stand in another folder
+    out = target_of(out.absolute())  # workers may be in another folder; the episodes wait beside a link's target
     shards = Shards(out.with_name(f"{out.name}.parts"))
     check_writable(out)
     if out.exists() and not shards.folder.exists():

@@ -10,7 +10,7 @@ import click
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.command import entry
-from modsoft.runtime.files import check_writable
+from modsoft.runtime.files import check_not_input, check_writable
 
 
 @click.group(
@@ -76,6 +76,7 @@ def cli(
         return
     if robot_file is None or out is None:
         raise click.UsageError(f"missing option {'--out' if robot_file else '--robot'}; see --help", context)
+    check_not_input(out, Path(robot_file))
     robot = robots.load(robot_file)
     given = dict(_option(text) for text in options)
     from tqdm import tqdm
@@ -129,6 +130,7 @@ def plot(data_files: tuple[Path, ...], out: Path) -> None:
       modsoft-collect plot staged.h5 random.h5 --out workspace.png
     """
     check_writable(out)
+    check_not_input(out, *data_files)
     from modsoft.training import coverage
 
     found = coverage.compare(list(data_files))

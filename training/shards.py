@@ -65,7 +65,7 @@ class Shards:
             return
         if self.finished():
             raise ModelError(f"{self.folder}: episodes without the recipe of modsoft-collect; choose another --out")
-        with written(told) as temporary:
+        with written(told, through_links=False) as temporary:
             temporary.write_text(json.dumps(recipe, indent=1), encoding="utf-8")
 
     def finished(self) -> set[int]:
@@ -108,7 +108,7 @@ class Shards:
             ) from error
 
     def write(self, index: int, episode: Episode) -> None:
-        with written(self.path(index)) as temporary, temporary.open("wb") as file:
+        with written(self.path(index), through_links=False) as temporary, temporary.open("wb") as file:
             np.savez(file, **episode._asdict())
 
     def remove(self) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from modsoft.runtime import robot as robots
 from modsoft.runtime.command import entry
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import NOT_AN_ARRAY, check_writable, written
+from modsoft.runtime.files import NOT_AN_ARRAY, check_not_input, check_writable, written
 from modsoft.runtime.robot import Robot
 
 Array = NDArray[np.float64]
@@ -80,6 +80,7 @@ def command(robot_file: str, actions: str, out: str) -> None:
     metres and directors (steps + 1, modules, 3, 3) with rows d1, d2, d3; row 0 is the robot at rest.
     """
     check_writable(Path(out))
+    check_not_input(Path(out), Path(actions), Path(robot_file))
     robot = robots.load(robot_file)
     run = simulate(robot, read_actions(actions, robot))
     write(out, run)

@@ -22,7 +22,7 @@ import torch
 
 from modsoft.runtime.configuration import feature_names, labels
 from modsoft.runtime.errors import ModelError, UsageError
-from modsoft.runtime.files import check_writable
+from modsoft.runtime.files import check_writable, target_of
 from modsoft.runtime.locks import locked
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import networks
@@ -118,6 +118,7 @@ def train(
     is given as it is, and a run goes on from `out.resume`; either of others is refused. Sets torch's threads and random
     state for the whole process. `InUse` while another process trains `out`."""
     check_writable(out)
+    out = target_of(out)  # what a run goes on from waits beside a link's target
     with locked(out.with_name(f"{out.name}.lock"), out, "modsoft-train"):
         return _train(data, out, settings, progress, clock)
 

@@ -12,7 +12,7 @@ import click
 
 from modsoft.runtime.command import entry
 from modsoft.runtime.errors import UsageError
-from modsoft.runtime.files import check_writable
+from modsoft.runtime.files import check_not_input, check_writable, target_of
 
 
 @click.command("modsoft-train", context_settings={"show_default": True})
@@ -67,6 +67,8 @@ def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
         if isinstance(value, float) and not math.isfinite(value):
             raise UsageError(f"--{name} {value}: expected a finite number")
     check_writable(out)
+    check_not_input(out, *data_files)
+    check_not_input((target := target_of(out)).with_name(f"{target.name}.resume"), *data_files)
     is_there = out.exists()
     # Before torch is loaded: by default its threads spin while they wait, and on a busy core that costs all speed.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

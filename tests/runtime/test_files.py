@@ -1,11 +1,12 @@
 """What is written: whole, or not at all and said in one line."""
 
 import os
+from pathlib import Path
 
 import pytest
 
 from modsoft.runtime.errors import OutputError, UsageError
-from modsoft.runtime.files import check_writable, written
+from modsoft.runtime.files import check_not_input, check_writable, make_folder, written
 
 
 def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path):
@@ -54,3 +55,88 @@ def test_a_folder_that_lets_nobody_write_is_told_before(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match="read-only") as told:
         check_writable(tmp_path / "out.bin")
     assert told.value.exit_code == 73
+
+
+# ---- Links ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def disk(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "home").mkdir()
+    return tmp_path / "disk"
+
+
+@pytest.mark.parametrize("exists", [True, False])
+@pytest.mark.parametrize("steps", [1, 2])
+def test_a_link_stays_and_its_target_is_written_beside_the_target(tmp_path, disk, exists, steps):
+    link, target = tmp_path / "home" / "out.bin", disk / "data.bin"
+    if steps == 2:
+        (tmp_path / "home" / "middle").symlink_to(target)
+    link.symlink_to("middle" if steps == 2 else "../disk/data.bin")
+    if exists:
+        target.write_bytes(b"old")
+    check_writable(link)
+    with written(link) as temporary:
+        assert temporary.parent == disk, "another disk cannot take a file by renaming"
+        temporary.write_bytes(b"new")
+    assert link.is_symlink()
+    assert not target.is_symlink()
+    assert target.read_bytes() == b"new"
+    assert os.listdir(disk) == ["data.bin"]
+
+
+def test_a_link_that_cannot_be_written_through_is_one_line(tmp_path, disk, monkeypatch):
+    home = tmp_path / "home"
+    (home / "loop").symlink_to("loop")
+    (home / "gone").symlink_to(disk / "absent" / "out.bin")
+    (home / "folder").symlink_to(disk)
+    (home / "device").symlink_to(os.devnull)
+    for name, found in (
+        ("loop", "leads to itself"),
+        ("gone", f"no folder {disk / 'absent'} for .*gone, a link to .*make it first"),
+        ("folder", "a folder; expected the name of a file"),
+        ("device", "a device or pipe; expected"),
+    ):
+        with pytest.raises(UsageError, match=found) as error, written(home / name):
+            pass
+        assert "\n" not in str(error.value)
+    (home / "out").symlink_to(disk / "out")
+    monkeypatch.setattr(os, "access", lambda path, mode: path != disk)
+    with pytest.raises(OutputError, match=f"a link to .*the folder {disk} is read-only"):
+        check_writable(home / "out")
+
+
+def test_in_a_folder_of_others_a_link_is_replaced(tmp_path, disk):
+    (disk / "private").write_bytes(b"mine")
+    link = tmp_path / "home" / "episode"
+    link.symlink_to(disk / "private")
+    with written(link, through_links=False) as temporary:
+        temporary.write_bytes(b"new")
+    assert (link.read_bytes(), (disk / "private").read_bytes()) == (b"new", b"mine")
+
+
+def test_a_folder_is_made_where_a_link_leads(tmp_path, disk):
+    (tmp_path / "home" / "runs").symlink_to(disk / "runs")
+    make_folder(tmp_path / "home" / "runs" / "figures")
+    assert (disk / "runs" / "figures").is_dir()
+    (disk / "file").touch()
+    with pytest.raises(OutputError, match="no such folder can be made"):
+        make_folder(disk / "file" / "folder")
+
+
+# ---- An output is never an input ------------------------------------------------------------------------------------
+
+
+def test_an_output_that_is_an_input_is_refused_under_any_name(tmp_path, monkeypatch):
+    source = tmp_path / "a.npy"
+    source.write_bytes(b"data")
+    (tmp_path / "soft").symlink_to(source)
+    os.link(source, tmp_path / "hard")
+    (tmp_path / "folder").symlink_to(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    for out in (source, "a.npy", "soft", "hard", "folder/a.npy", "./a.npy"):
+        with pytest.raises(UsageError, match=r"input .*a\.npy, which would be replaced; give the output another name"):
+            check_not_input(Path(out), tmp_path / "other", source)
+    check_not_input(tmp_path / "b.npy", source, tmp_path / "absent")
+    check_not_input(tmp_path / "absent", source, tmp_path / "absent")

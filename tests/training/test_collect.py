@@ -194,6 +194,23 @@ def test_an_episode_that_is_not_finite_does_not_pass_the_last_door(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_through_a_link_everything_goes_to_its_target(tmp_path):
+    home, disk = tmp_path / "home", tmp_path / "disk"
+    home.mkdir()
+    disk.mkdir()
+    (home / "data.h5").symlink_to("../disk/d.h5")
+    robot, seen = of_modules("pneumatic", 3, 0.4), set()
+
+    def look(done, samples):
+        seen.update(path.name for path in disk.iterdir())
+
+    c.collect(robot, home / "data.h5", 60, "staged", 1, 30, plant=plant(), progress=look)
+    assert seen == {"d.h5.lock", "d.h5.parts"}
+    assert [path.name for path in disk.iterdir()] == ["d.h5"]
+    assert [path.name for path in home.iterdir()] == ["data.h5"]
+    assert (home / "data.h5").is_symlink()
+
+
 def test_a_folder_that_is_not_there_is_a_usage_error(tmp_path):
     with pytest.raises(UsageError, match="no folder"):
         c.collect(of_modules("pneumatic", 2), tmp_path / "none" / "d.h5", 10, plant=plant())

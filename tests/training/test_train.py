@@ -152,6 +152,19 @@ def test_a_second_training_of_the_same_model_is_refused_and_changes_nothing(tmp_
     assert list(tmp_path.iterdir()) == [out]
 
 
+def test_through_a_link_everything_goes_to_its_target(tmp_path):
+    home, disk = tmp_path / "home", tmp_path / "disk"
+    home.mkdir()
+    disk.mkdir()
+    (home / "model.pt").symlink_to(disk / "m.pt")
+    seen = set()
+    train.train([make()], home / "model.pt", SMALL, lambda _: seen.update(path.name for path in disk.iterdir()))
+    assert seen == {"m.pt.lock", "m.pt.resume"}
+    assert [path.name for path in disk.iterdir()] == ["m.pt"]
+    assert [path.name for path in home.iterdir()] == ["model.pt"]
+    assert (home / "model.pt").is_symlink()
+
+
 class Cut(Exception):
     """Stands for a kill: nothing of the run is told that it comes."""
 

@@ -7,7 +7,8 @@ import zipfile
 import zlib
 from pathlib import Path
 
-from modsoft.runtime.errors import OutputError, UsageError
+from modsoft.runtime.errors import UsageError
+from modsoft.runtime.files import make_folder
 from modsoft.study.plan import Model, Run
 
 # What numpy raises for a file of arrays that is none, or damaged.
@@ -37,10 +38,7 @@ class Folder:
 
     def make(self) -> None:
         for name in ("data", "models", "estimates", "runs", "floors", "figures"):
-            try:
-                (self.out / name).mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise OutputError(f"{self.out / name}: no such folder can be made ({error.strerror})") from error
+            make_folder(self.out / name)
 
     def data(self, name: str) -> Path:
         return self.out / "data" / f"{name}.h5"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import written
+from modsoft.runtime.files import check_not_input, make_folder, written
 from modsoft.study import figures, measure, tables
 from modsoft.study.cells import table
 from modsoft.study.folder import Folder
@@ -52,6 +52,7 @@ knows the tasks."""
 
 def write(folder: Folder) -> None:
     """Writes report.md; `ModelError` where there are no results."""
+    check_not_input(folder.report, folder.results, folder.notes)
     text = "\n".join(lines(measure.load(folder.results), _notes(folder))) + "\n"
     with written(folder.report) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -60,7 +61,7 @@ def write(folder: Folder) -> None:
 def publish(study: Folder, to: Folder) -> None:
     """Copies what people read of a study, its numbers and figures; runs, models and data stay where they are."""
     measure.load(study.results)
-    to.figures.mkdir(parents=True, exist_ok=True)
+    make_folder(to.figures)
     pictures = [study.figures / f"{name}.png" for name in figures.CAPTIONS]
     missing = [picture.name for picture in pictures if not picture.is_file()]
     if missing:
