@@ -13,6 +13,7 @@ from modsoft.runtime import robot as robots
 from modsoft.runtime.artefact import Network
 from modsoft.runtime.configuration import feature_names
 from modsoft.runtime.errors import ModelError, RobotFileError
+from modsoft.runtime.files import read_text
 from modsoft.training import checkpoint as checkpoints
 
 UNTOLD = (
@@ -53,10 +54,8 @@ def files_of(meta: Path) -> list[Path]:
 
 def _meta(meta: Path) -> MetaFile:
     try:
-        return msgspec.convert(tomllib.loads(meta.read_text(encoding="utf-8")), MetaFile)
-    except OSError as error:
-        raise ModelError(f"{meta}: cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+        return msgspec.convert(tomllib.loads(read_text(meta)), MetaFile)
+    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
         raise ModelError(f"{meta}: {error}; expected {UNTOLD}") from error
 
 

@@ -24,35 +24,40 @@ def _print_ports() -> None:
 
 
 def _check_robot(name: str) -> None:
-    from modsoft.runtime.trajectory import load_task  # --help does without numpy
+    from modsoft.runtime.trajectory import load_task, task_of  # --help does without numpy
 
-    robot = robots.load(name)
-    if robot.loop.task:
+    robot, folder = robots.load(name), robots.folder_of(name)
+    task, steps = task_of(robot, folder), 0
+    if task:
         try:
-            load_task(robot.loop.task, robot)
+            steps = len(load_task(task, robot))
         except UsageError as error:
             raise RobotFileError(f"{name}: task under [loop]: {error}") from error
     click.echo(f"{name}: {robot.name}, {robot.robot.kind}, {robot.modules} modules, {robot.loop.hz:g} Hz")
+    if task:
+        click.echo(f"task {task}: {steps} steps, {steps * robot.loop.period_s:g} s")
     if robot.valve is not None:
         valve = robot.valve
         click.echo(f"valves: {valve.model}, full scale {valve.full_scale_bar:g} bar, {valve.p_min_bar:g} to "
                    f"{valve.p_max_bar:g} bar; is full_scale_bar what the label says?")  # fmt: skip
     for chamber in robot.chambers:
         click.echo(f"module {chamber.module} side {chamber.side}: channel {chamber.channel}")
-    open_ends = _open_ends(robot, Path(name).parent if Path(name).is_file() else Path())
+    open_ends = _open_ends(robot, folder)
     if open_ends:
         click.echo(f"still to fill in before a run: {'; '.join(open_ends)}")
     click.echo("ok")
 
 
 def _open_ends(robot: robots.Robot, beside: Path) -> list[str]:
-    """What a valid robot file leaves to the command line, in words. Tool files lie in the folder `beside`."""
+    """What a valid robot file leaves to the command line, in words. Its paths start from the folder `beside`."""
     found = [] if robot.loop.task else ["task under [loop], or --task"]
     if robot.valve is None:
         return found  # simulated: there is nothing to connect
     tracker = robot.tracker
     if not tracker.port:
         found.append("port under [tracker], or --tracker-port")
+    elif tracker.source == "replay" and not (beside / tracker.port).exists():
+        found.append(f"{beside / tracker.port}, which is not there")
     if tracker.source == "ndi" and tracker.type != "aurora":  # aurora's tools are wired
         if not tracker.tools:
             found.append("tools under [tracker], or --tool")
@@ -94,7 +99,7 @@ def _somebody_there() -> bool:
               help="Controller, written by modsoft-export.")  # fmt: skip
 @click.option("--task", default="", metavar="NAME|FILE",
               help="edge, down, or a .npy file of desired configurations (steps, modules, 3). [default: task under "
-                   "[loop] in the robot file]")  # fmt: skip
+                   "[loop] in the robot file; a file's path there starts from the robot file's folder, as all do]")  # fmt: skip
 @click.option("--steps", type=click.IntRange(1), metavar="N", help="Stop after the first N control steps.")
 @click.option("--correction", default="none", show_default=True, type=click.Choice(["none", "integral"]),
               help="integral: the accumulated configuration error shifts what the model is asked for.")  # fmt: skip

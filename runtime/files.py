@@ -3,6 +3,7 @@ never replaces an input or what is no regular file."""
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import os
 import socket
@@ -10,10 +11,44 @@ from collections.abc import Iterator
 from pathlib import Path
 from tokenize import TokenError
 
-from modsoft.runtime.errors import ModelError, OutputError, UsageError
+from modsoft.runtime.errors import ModelError, ModsoftError, OutputError, UsageError
 
 # What numpy.load raises for a file that is damaged, none of its own, or claims to be huge.
 NOT_AN_ARRAY = (ValueError, EOFError, MemoryError, TokenError)
+
+
+# Byte order marks. That of UTF-32 comes first: it begins with the one of UTF-16.
+MARKS = {
+    codecs.BOM_UTF32_LE: "utf-32-le",
+    codecs.BOM_UTF32_BE: "utf-32-be",
+    codecs.BOM_UTF8: "utf-8",
+    codecs.BOM_UTF16_LE: "utf-16-le",
+    codecs.BOM_UTF16_BE: "utf-16-be",
+}
+
+
+def decoded(data: bytes) -> str:
+    """Text in UTF-8, or in whatever Unicode its byte order mark names, as editors and shells of Windows write it. Ends
+    of lines become \\n. ValueError in words for anything else."""
+    mark, encoding = next(((mark, name) for mark, name in MARKS.items() if data.startswith(mark)), (b"", "utf-8"))
+    try:
+        text = data[len(mark) :].decode(encoding)
+    except UnicodeDecodeError as error:
+        where = f"byte {data[len(mark) + error.start]:#04x} at offset {len(mark) + error.start}"
+        raise ValueError(f"not {encoding.upper()} text ({where}); save it as UTF-8") from error
+    if "\0" in text:
+        raise ValueError("holds zero bytes: not text, or UTF-16 without a byte order mark; save it as UTF-8")
+    return text.replace("\r\n", "\n")
+
+
+def read_text(path: Path, wrong: type[ModsoftError] = ModelError) -> str:
+    """The text of a file that people write; see `decoded`. `wrong` in one line where there is none."""
+    try:
+        return decoded(path.read_bytes())
+    except OSError as error:
+        raise wrong(f"{path}: cannot be read ({error.strerror or error})") from error
+    except ValueError as error:
+        raise wrong(f"{path}: {error}") from error
 
 
 def check_is_file(path: Path, what: str, advice: str) -> None:

@@ -18,6 +18,7 @@ from msgspec import Meta
 
 from modsoft.runtime.errors import RobotFileError
 from modsoft.runtime.explain import explain
+from modsoft.runtime.files import read_text
 
 
 class Kind(NamedTuple):
@@ -82,7 +83,8 @@ class Limits(Section, frozen=True):
 
 
 class Tracker(Section, frozen=True):
-    """`[tracker]`: source and its port; `tools` are the tool definition files, base first, then module 1 to N."""
+    """`[tracker]`: source and its port (replay: a run's folder); `tools` are the tool definition files, base first, then
+    module 1 to N. Paths start from the robot file's folder."""
 
     source: Literal["ndi", "replay"] = "ndi"
     type: Literal["polaris", "vega", "aurora"] = "polaris"
@@ -98,7 +100,8 @@ class Serial(Section, frozen=True):
 
 
 class Loop(Section, frozen=True):
-    """`[loop]`: control rate, and the task that runs when none is told."""
+    """`[loop]`: control rate, and the task that runs when none is given: its name, or a file's path that starts from the
+    robot file's folder."""
 
     hz: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.5
     task: str = ""
@@ -169,12 +172,14 @@ def load(file_or_name: str | Path) -> Robot:
     if path.is_dir():
         raise RobotFileError(f"{path} is a folder, expected a robot file; give the file, such as {path / 'robot.toml'}")
     if path.is_file():
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise RobotFileError(f"{path}: cannot be read as UTF-8 text ({error})") from error
-        return parse(text, str(path))
+        return parse(read_text(path, RobotFileError), str(path))
     return shipped(str(file_or_name))
+
+
+def folder_of(file_or_name: str | Path) -> Path:
+    """The folder that the paths in a robot file start from: its own, or for a shipped robot the current one."""
+    path = Path(file_or_name)
+    return path.parent if path.is_file() else Path()
 
 
 def shipped(name: str) -> Robot:

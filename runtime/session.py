@@ -38,6 +38,7 @@ from modsoft.runtime.errors import (
     Tripped,
     UsageError,
 )
+from modsoft.runtime.files import read_text
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.ports import find_port, ports_here
 from modsoft.runtime.protocol import VentMode
@@ -46,8 +47,8 @@ from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameJudge, check_rest
 from modsoft.runtime.stop import Keys, Signals, Stop, StopKey
 from modsoft.runtime.tally import Tally
-from modsoft.runtime.tracker import Reader, Slot, open_source
-from modsoft.runtime.trajectory import load_task
+from modsoft.runtime.tracker import Reader, Slot, open_source, port_of
+from modsoft.runtime.trajectory import load_task, task_of
 
 Array = NDArray[np.float64]
 
@@ -84,7 +85,7 @@ def run(options: Options) -> None:
                              "give --dry-run, or --tracker ndi")  # fmt: skip
         port = _port(options.port or robot.serial.port)
     controller, digest = _model(options.model, robot)
-    task = options.task or robot.loop.task
+    task = options.task or task_of(robot, beside)
     desired = _task(task, robot)[: options.steps]
     tools = list(options.tools) or [beside / tool for tool in robot.tracker.tools]
 
@@ -98,7 +99,7 @@ def run(options: Options) -> None:
     with ExitStack() as exits:
         signals = exits.enter_context(Signals(stop, leave))
         slot = Slot()
-        reader = Reader(open_source(robot, options.tracker_port or robot.tracker.port, tools), slot)
+        reader = Reader(open_source(robot, options.tracker_port or port_of(robot, beside), tools), slot)
         exits.callback(reader.close)
         rest = _rest(slot, FrameJudge(robot), stop)
         controller.warm_up(robot.modules)
@@ -198,8 +199,8 @@ def _robot(options: Options) -> tuple[Robot, str, Path]:
         table = robot.to_dict()
         table["tracker"]["source"] = options.tracker
         robot = robots.from_dict(table, options.robot)
-    text = path.read_text(encoding="utf-8") if path.is_file() else robots.text_of(options.robot)
-    return robot, text, path.parent if path.is_file() else Path()
+    text = read_text(path, RobotFileError) if path.is_file() else robots.text_of(options.robot)
+    return robot, text, robots.folder_of(path)
 
 
 def _port(told: str) -> str:

@@ -161,6 +161,12 @@ def _recorded(text: str) -> Iterator[tuple[float, Frame]]:
         yield at_s, Frame(seen["number"], at_s, poses, np.array(seen["valid"], dtype=bool), quality)
 
 
+def port_of(robot: Robot, folder: Path) -> str:
+    """The port under [tracker]; a recorded run's path starts from `folder`, that of the robot file."""
+    tracker = robot.tracker
+    return str(folder / tracker.port) if tracker.source == "replay" and tracker.port else tracker.port
+
+
 def open_source(robot: Robot, port: str, tools: list[Path]) -> Source:
     """The source that the robot file names. `port`: of the tracker, or a run's folder for `replay`; `tools`: definition
     files, base first. Raises `UsageError` for what was not told, `DeviceAbsent` for what is not there."""

@@ -94,9 +94,19 @@ def task(name: str, kind: str, modules: int) -> Array:
             return task_planar(DOWN_DEG[modules])
 
 
+def task_of(robot: Robot, folder: Path) -> str:
+    """The task under [loop], as `load_task` takes it; `folder`: where the robot file's paths start from."""
+    task = robot.loop.task
+    return str(folder / task) if _is_file_name(task) else task
+
+
+def _is_file_name(task: str) -> bool:
+    return task.lower().endswith(".npy")
+
+
 def load_task(name_or_file: str, robot: Robot) -> Array:
     """A task by its name, or from a .npy file of unit vectors (steps, N, 3)."""
-    if not name_or_file.endswith(".npy"):
+    if not _is_file_name(name_or_file):
         return task(name_or_file, robot.robot.kind, robot.modules)
     if Path(name_or_file).is_dir():
         raise UsageError(f"task file {name_or_file} is a folder; give an existing .npy file or a task's name")

@@ -22,7 +22,7 @@ import click
 from modsoft.runtime import log
 from modsoft.runtime.command import entry
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import check_not_input, written
+from modsoft.runtime.files import check_not_input, read_text, written
 
 ROOT = Path(__file__).resolve().parents[1]
 Line = dict[str, Any]
@@ -115,7 +115,7 @@ def read(path: Path) -> dict[int, list[Line]]:
     """The lines of each row, in the order of their tests. A line that is said again replaces the one before, so that a
     file may be added to. `ModelError` for what is no such line."""
     found: dict[int, dict[tuple[str, str], Line]] = defaultdict(dict)
-    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, text in enumerate(read_text(path).splitlines(), start=1):
         try:
             line = json.loads(text)
             missing = [name for name in FIELDS if name not in line]

@@ -58,7 +58,7 @@ class Shards:
         told = self.folder / "recipe.json"
         if told.is_file():
             try:
-                found = json.loads(told.read_text(encoding="utf-8"))
+                found = json.loads(told.read_bytes())  # bytes: JSON tells its encoding itself
             except (OSError, ValueError, RecursionError) as error:
                 raise ModelError(f"{told}: cannot be read ({error}); delete its folder to start anew") from error
             refuse_other(found, recipe, self.folder)

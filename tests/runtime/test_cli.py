@@ -5,9 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.tracker import port_of
 
 SCRIPT = Path(sys.executable).with_name("modsoft-runtime")
 
@@ -108,6 +110,38 @@ def test_check_proves_the_task(tmp_path, task, expected):
     line = refused(64, "--check", path, cwd=tmp_path)
     assert "task under [loop]" in line
     assert expected in line
+
+
+@pytest.mark.parametrize("folder", ["lab", "."])
+def test_the_task_of_a_robot_file_is_beside_it(tmp_path, model_file, folder):
+    """A file of the same name in the current folder is another task."""
+    lab = tmp_path / "lab"
+    lab.mkdir()
+    for path, steps in ((lab / "t.npy", 10), (tmp_path / "t.npy", 7)):
+        np.save(path, np.tile([0.0, 0.0, 1.0], (steps, 3, 1)))
+    text = robots.text_of("pneumatic-3").replace('task = "down"', 'task = "t.npy"')
+    (lab / "robot.toml").write_text(text)
+    (tmp_path / "robot.toml").write_text(text)
+    lines = run("--check", f"{folder}/robot.toml", cwd=tmp_path).stdout.splitlines()
+    shown = "lab/t.npy: 10 steps, 4 s" if folder == "lab" else "t.npy: 7 steps, 2.8 s"
+    assert f"task {shown}" in lines
+    (lab / "t.npy").unlink()
+    if folder == "lab":
+        assert "no task file 'lab/t.npy'" in refused(64, "--check", "lab/robot.toml", cwd=tmp_path)
+        order = ["--robot", "lab/robot.toml", "--model", model_file, "--dry-run"]
+        assert "no task file 'lab/t.npy'" in refused(2, *order, cwd=tmp_path)
+
+
+def test_a_recorded_run_in_a_robot_file_is_beside_it(tmp_path):
+    lab = tmp_path / "lab"
+    (lab / "run").mkdir(parents=True)
+    text = robots.text_of("pneumatic-3").replace('source = "ndi"', 'source = "replay"')
+    (lab / "robot.toml").write_text(text.replace('port = ""                    # such', 'port = "run"  # such'))
+    robot = robots.load(lab / "robot.toml")
+    assert port_of(robot, robots.folder_of(lab / "robot.toml")) == str(lab / "run")
+    assert "not there" not in run("--check", "lab/robot.toml", cwd=tmp_path).stdout
+    (lab / "run").rmdir()
+    assert "lab/run, which is not there" in run("--check", "lab/robot.toml", cwd=tmp_path).stdout
 
 
 def test_list_ports():

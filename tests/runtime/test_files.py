@@ -1,12 +1,14 @@
 """What is written: whole, or not at all and said in one line."""
 
+import codecs
 import os
 from pathlib import Path
 
 import pytest
 
-from modsoft.runtime.errors import OutputError, UsageError
-from modsoft.runtime.files import check_not_input, check_writable, make_folder, written
+from modsoft.runtime import robot as robots
+from modsoft.runtime.errors import ModelError, OutputError, RobotFileError, UsageError
+from modsoft.runtime.files import check_not_input, check_writable, make_folder, read_text, written
 
 
 def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path):
@@ -140,3 +142,43 @@ def test_an_output_that_is_an_input_is_refused_under_any_name(tmp_path, monkeypa
             check_not_input(Path(out), tmp_path / "other", source)
     check_not_input(tmp_path / "b.npy", source, tmp_path / "absent")
     check_not_input(tmp_path / "absent", source, tmp_path / "absent")
+
+
+# ---- Text as Windows writes it --------------------------------------------------------------------------------------
+
+ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"]
+
+
+def encoded(text: str, encoding: str) -> bytes:
+    mark = {"utf-16-le": codecs.BOM_UTF16_LE, "utf-16-be": codecs.BOM_UTF16_BE}.get(encoding, b"")
+    return mark + text.replace("\n", "\r\n").encode(encoding)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_text_is_read_in_every_encoding_with_a_byte_order_mark(tmp_path, encoding):
+    (tmp_path / "t").write_bytes(encoded("a = 'größer'\nb\n", encoding))
+    assert read_text(tmp_path / "t") == "a = 'größer'\nb\n"
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_robot_file_is_read_in_every_encoding(tmp_path, encoding):
+    path = tmp_path / "robot.toml"
+    path.write_bytes(encoded(robots.text_of("pneumatic-3"), encoding))
+    assert robots.load(path) == robots.load("pneumatic-3")
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"a = 'gr\xf6\xdfer'", r"not UTF-8 text \(byte 0xf6 at offset 7\); save it as UTF-8"),
+        (b"\x93NUMPY\x01\x00v\x00", r"not UTF-8 text \(byte 0x93 at offset 0\)"),
+        (b"a\0 \0=\0", "zero bytes: not text, or UTF-16 without a byte order mark"),
+        (codecs.BOM_UTF16_LE + b"a\0b", r"not UTF-16-LE text"),
+    ],
+)
+def test_what_is_not_text_is_one_line(tmp_path, content, found):
+    path = tmp_path / "robot.toml"
+    path.write_bytes(content)
+    for read, error in ((read_text, ModelError), (robots.load, RobotFileError)):
+        with pytest.raises(error, match=rf"^[^\n]*robot\.toml: [^\n]*{found}[^\n]*$"):
+            read(path)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from modsoft.runtime.configuration import angle_between_deg
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import written
+from modsoft.runtime.files import decoded, written
 from modsoft.study import flights, making, paper
 from modsoft.study.flights import Kept
 from modsoft.study.folder import Folder
@@ -71,7 +71,7 @@ def dumped(found: dict[str, Any]) -> str:
 def load(path: Path) -> dict[str, Any]:
     """results.json as it was written."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(decoded(path.read_bytes()))
         wrong = {frozenset(record) ^ frozenset(KEYS) for record in found["records"]} - {frozenset()}
         if wrong or "about" not in found:
             raise ValueError(f"keys {sorted(set().union(*wrong))}")

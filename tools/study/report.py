@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import check_not_input, make_folder, written
+from modsoft.runtime.files import check_not_input, make_folder, read_text, written
 from modsoft.study import figures, measure, tables
 from modsoft.study.cells import table
 from modsoft.study.folder import Folder
@@ -72,7 +72,7 @@ def publish(study: Folder, to: Folder) -> None:
 
 
 def _notes(folder: Folder) -> str:
-    return folder.notes.read_text(encoding="utf-8").strip() if folder.notes.is_file() else ""
+    return read_text(folder.notes).strip() if folder.notes.is_file() else ""
 
 
 def lines(found: dict[str, Any], notes: str) -> list[str]:
