@@ -99,7 +99,7 @@ def _somebody_there() -> bool:
               help="Controller, written by modsoft-export.")  # fmt: skip
 @click.option("--task", default="", metavar="NAME|FILE",
               help="edge, down, or a .npy file of desired configurations (steps, modules, 3). [default: task under "
-                   "[loop] in the robot file; a file's path there starts from the robot file's folder, as all do]")  # fmt: skip
+                   "[loop] in the robot file, where every path starts from that file's folder]")  # fmt: skip
 @click.option("--steps", type=click.IntRange(1), metavar="N", help="Stop after the first N control steps.")
 @click.option("--correction", default="none", show_default=True, type=click.Choice(["none", "integral"]),
               help="integral: the accumulated configuration error shifts what the model is asked for.")  # fmt: skip

@@ -83,8 +83,8 @@ class Limits(Section, frozen=True):
 
 
 class Tracker(Section, frozen=True):
-    """`[tracker]`: source and its port (replay: a run's folder); `tools` are the tool definition files, base first, then
-    module 1 to N. Paths start from the robot file's folder."""
+    """`[tracker]`: source and its port (replay: a run's folder); `tools` are the tool definition files, base first,
+    then module 1 to N. Paths start from the robot file's folder."""
 
     source: Literal["ndi", "replay"] = "ndi"
     type: Literal["polaris", "vega", "aurora"] = "polaris"
@@ -100,8 +100,8 @@ class Serial(Section, frozen=True):
 
 
 class Loop(Section, frozen=True):
-    """`[loop]`: control rate, and the task that runs when none is given: its name, or a file's path that starts from the
-    robot file's folder."""
+    """`[loop]`: control rate, and the task that runs when none is given: its name, or a file's path that starts from
+    the robot file's folder."""
 
     hz: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.5
     task: str = ""
