@@ -13,6 +13,7 @@ from types import FrameType
 
 import click
 
+from modsoft.runtime import process
 from modsoft.runtime.errors import INTERNAL_EXIT_CODE, DeviceAbsent, ModsoftError, OutputError
 
 BROKEN_PIPE_EXIT_CODE = 141  # a shell's for SIGPIPE, as of every program before `| head`
@@ -45,6 +46,7 @@ def entry(command: click.Command, goes_on: bool = False) -> Callable[[], None]:
     """
 
     def main() -> None:
+        process.prepare()
         _replace_closed_streams()
         with _signals_raise():
             code = _run(command, "interrupted; the same command goes on" if goes_on else "interrupted")
@@ -57,6 +59,7 @@ def _run(command: click.Command, interrupted: str) -> int:
     """The exit code; what there is to say is said."""
     output = sys.stdout
     try:
+        process.check_import()
         code = command.main(standalone_mode=False)
         return code if isinstance(code, int) else 0
     except SystemExit:

@@ -11,13 +11,12 @@ import os
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 from numpy.typing import ArrayLike, NDArray
-from onnxruntime.capi import onnxruntime_pybind11_state as onnxruntime_errors
 
 from modsoft.runtime import artefact, configuration
 from modsoft.runtime.artefact import ACTUATION, FEATURES, FROM_NEIGHBOURS, TO_NEIGHBOURS, Description
 from modsoft.runtime.errors import ModelError
+from modsoft.runtime.ort import onnxruntime, onnxruntime_errors
 from modsoft.runtime.robot import KINDS, Robot
 
 Array = NDArray[np.float64]

@@ -39,7 +39,7 @@ def run(task: Callable[[Item], None], items: list[Item], jobs: int) -> Iterator[
     processes = []
     busy: list[Connection] = []
     try:
-        with _one_thread_each():
+        with _environment():
             for _ in range(min(jobs, len(items))):
                 ours, theirs = context.Pipe()
                 process = context.Process(target=_work, args=(task, theirs), daemon=True)
@@ -92,9 +92,9 @@ def _work(task: Callable[[Any], None], connection: Connection) -> None:
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """For processes started inside: a core each, no threads within."""
-    names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+def _environment() -> Iterator[None]:
+    """For processes started inside: a core each, no threads within, and no imports from the current folder."""
+    names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PYTHONSAFEPATH")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))
     try:

@@ -24,6 +24,19 @@ def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert emulator.choose("auto") == "native"
 
 
+def test_a_checkout_of_another_user_is_built_elsewhere() -> None:
+    code = (
+        "from modsoft.runtime import process\n"
+        "process.is_writable = lambda folder: False\n"
+        "from modsoft.hil import emulator\n"
+        "print(emulator.build('native'), emulator.FIRMWARE_ELF)\n"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
+    for path in done.stdout.split():
+        assert not Path(path).is_relative_to(emulator.ROOT)
+        assert not Path(path).exists(), "it ends with its process"
+
+
 def test_unknown_board_is_refused() -> None:
     with pytest.raises(DeviceAbsent, match="simavr, native and auto"):
         EmulatedBoard("mega")

@@ -19,6 +19,7 @@ from typing import Any
 import click
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.command import entry
 from modsoft.training import plants
 from modsoft.training.backends import cores
 
@@ -38,8 +39,9 @@ def collected(robot: str, samples: int, jobs: int) -> dict[str, Any]:
         asked = ["--robot", robot, "--samples", str(samples), "--jobs", str(jobs), "--out", str(out)]
         start_s = time.perf_counter()
         found = subprocess.run(
-            [sys.executable, "-c", MEASURED, *asked], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True
-        )
+            [sys.executable, "-P", "-c", MEASURED, *asked],
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True,
+        )  # fmt: skip
         seconds = time.perf_counter() - start_s
         size = out.stat().st_size
     return {
@@ -90,4 +92,4 @@ def main(json_file: Path | None, quick: bool) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    entry(main)()

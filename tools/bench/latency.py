@@ -35,6 +35,7 @@ from modsoft.hil.rig import Child
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board import Board
 from modsoft.runtime.clock import Ticker
+from modsoft.runtime.command import entry
 from modsoft.runtime.configuration import from_angles_deg
 from modsoft.runtime.controller import Controller
 from modsoft.runtime.log import host
@@ -249,4 +250,4 @@ def main(json_file: Path | None, quick: bool, model: Path | None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    entry(main)()

@@ -23,6 +23,7 @@ import click
 import numpy as np
 
 from modsoft.runtime.clock import Ticker
+from modsoft.runtime.command import entry
 from modsoft.runtime.log import host
 from modsoft.runtime.stop import Stop
 
@@ -174,4 +175,4 @@ def main(json_file: Path | None, seconds: float, quick: bool) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    entry(main)()

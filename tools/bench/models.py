@@ -13,6 +13,7 @@ import click
 
 from modsoft.runtime import correction, trajectory
 from modsoft.runtime import robot as robots
+from modsoft.runtime.command import entry
 from modsoft.runtime.controller import Controller
 from modsoft.training.evaluate import Pilot, angle_errors_deg, configuration_errors_percent, fly
 from modsoft.training.fleet import simulated
@@ -63,4 +64,4 @@ def main(out: Path | None, quick: bool) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    entry(main)()

@@ -24,6 +24,7 @@ import click
 import elastica
 import numpy as np
 
+from modsoft.runtime.command import entry
 from modsoft.runtime.errors import DeviceAbsent, ModsoftError
 from modsoft.training import kernel
 from modsoft.training.arm import Arm, _Loads, _Simulator
@@ -259,4 +260,4 @@ def main(kinds: tuple[str, ...], json_file: Path | None, picture: Path | None, q
 
 
 if __name__ == "__main__":
-    main()
+    entry(main)()

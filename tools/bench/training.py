@@ -35,6 +35,7 @@ import numpy as np
 import torch
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.command import entry
 from modsoft.training import collect, dataset, train
 from modsoft.training.dataset import DataSet, Windows
 from modsoft.training.networks import BiLSTM
@@ -311,4 +312,4 @@ def main(json_file: Path | None, quick: bool, data: Path | None, minutes: float,
 
 
 if __name__ == "__main__":
-    main()
+    entry(main)()

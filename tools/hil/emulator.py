@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 import shutil
 import subprocess
 import tempfile
@@ -23,6 +24,7 @@ from typing import IO, Any, Literal
 
 import msgspec
 
+from modsoft.runtime import process
 from modsoft.runtime.errors import DeviceAbsent
 
 Event = dict[str, Any]
@@ -31,8 +33,11 @@ BoardName = Literal["simavr", "native"]
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ROOT / "tools" / "hil"
 FIRMWARE = ROOT / "firmware"
-BUILD = ROOT / "build" / "hil"
-FIRMWARE_ELF = ROOT / "build" / "firmware" / "modsoft.elf"
+
+BUILD = ROOT / "build"
+if not process.is_writable(BUILD):  # a checkout that belongs to another user
+    BUILD = process.temporary_folder() / "build"
+FIRMWARE_ELF = BUILD / "firmware" / "modsoft.elf"
 BOOTLOADER = Path(
     "/usr/share/arduino/hardware/arduino/avr/bootloaders/stk500v2/stk500boot_v2_mega2560.hex"
 )  # of Debian's arduino-core-avr
@@ -93,12 +98,13 @@ def build(board: BoardName, *, firmware: bool = True) -> Path:
         raise DeviceAbsent("the emulated board is built from its sources: run this from a clone of the repository")
     if missing := missing_packages(board):
         raise DeviceAbsent(f"the {board} board needs Debian packages: sudo apt install {' '.join(missing)}")
-    BUILD.mkdir(parents=True, exist_ok=True)
-    program = BUILD / f"{board}_board"
-    with (BUILD / f"{board}.lock").open("w") as lock:  # several test runs may want it at once
+    folder = BUILD / "hil"
+    folder.mkdir(parents=True, exist_ok=True)
+    program = folder / f"{board}_board"
+    with (folder / f"{board}.lock").open("w") as lock:  # several test runs may want it at once
         fcntl.flock(lock, fcntl.LOCK_EX)
         if board == "simavr" and firmware:
-            _run(("make", "-s", "-C", str(FIRMWARE)), "the firmware does not build")
+            _run(("make", "-s", "-C", str(FIRMWARE), f"OUT={os.path.relpath(FIRMWARE_ELF.parent, FIRMWARE)}"), "the firmware does not build")
         sources = _BOARD_SOURCES[board]
         headers = (*SOURCES.glob("*.h"), *FIRMWARE.glob("*.h"))
         newest = max(path.stat().st_mtime for path in (*sources, *headers))

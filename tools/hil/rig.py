@@ -49,7 +49,7 @@ class Child:
         self._stderr = tempfile.TemporaryFile()
         self.summary: Line = {}
         self.process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
+            [sys.executable, "-P", "-m", module, *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._stderr,

@@ -1,0 +1,77 @@
+"""Settings of a whole process, made before other libraries are imported: writable folders for their caches, and no
+imports from the current folder. Child processes inherit them."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+from modsoft.runtime.errors import UsageError
+
+# Folders that libraries (numba, matplotlib, torch, onnxruntime, dask) write to, and their defaults below the home.
+BELOW_HOME = {"XDG_CACHE_HOME": ".cache", "XDG_CONFIG_HOME": ".config", "XDG_DATA_HOME": ".local/share",
+              "XDG_STATE_HOME": ".local/state"}  # fmt: skip
+IF_SET = ("NUMBA_CACHE_DIR", "MPLCONFIGDIR", "TORCH_HOME", "TORCHINDUCTOR_CACHE_DIR", "DASK_TEMPORARY_DIRECTORY")
+PARTS = ("runtime", "training", "export", "hil", "study")
+
+
+def prepare() -> None:
+    """Call it before any import of those libraries; again does no harm."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # of child processes: a script in the current folder may have a module's name
+    if os.name == "posix":
+        _replace_unwritable_folders()
+
+
+def check_import() -> None:
+    """`UsageError` where a folder `modsoft` on Python's path, another clone for instance, shadows the installation:
+    modsoft is a namespace package, to which every folder of that name adds its modules."""
+    import modsoft
+
+    for portion in map(Path, modsoft.__path__):
+        installed = any(portion.parent.glob("modsoft-*.dist-info"))
+        if not installed and any((portion / part).is_dir() for part in PARTS):
+            raise UsageError(
+                f"the folder {portion.resolve()} shadows the installed modsoft; run from another folder "
+                "or take it off PYTHONPATH"
+            )
+
+
+def is_writable(folder: Path) -> bool:
+    """Whether files can be made in `folder`, or in the nearest folder above it that exists."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    probe = folder / f".modsoft-probe-{os.getpid()}"
+    try:
+        os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+        os.unlink(probe)
+    except OSError:
+        return False
+    return True
+
+
+@functools.cache
+def temporary_folder() -> Path:
+    """Of this process, deleted at its end."""
+    folder = tempfile.mkdtemp(prefix="modsoft-home-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def _replace_unwritable_folders() -> None:
+    """A user without a home (a container's --user), or with one that is read-only, gets temporary folders."""
+    if os.environ.get("HOME") == "":
+        del os.environ["HOME"]  # else it stands for /
+    home = os.path.expanduser("~")
+    if not (os.path.isabs(home) and os.path.isdir(home) and is_writable(Path(home))):
+        home = os.environ["HOME"] = str(temporary_folder() / "home")
+        os.makedirs(home, exist_ok=True)
+    for name, default in BELOW_HOME.items():
+        if not is_writable(Path(os.environ.get(name) or Path(home, default))):
+            os.environ[name] = str(temporary_folder() / name.lower())
+    for name in IF_SET:
+        if name in os.environ and not is_writable(Path(os.environ[name])):
+            os.environ[name] = str(temporary_folder() / name.lower())
