@@ -26,7 +26,8 @@ def _run_tests() -> None:
     """Build with counters, and run the tests on that build."""
     shutil.rmtree(BUILD, ignore_errors=True)
     instrument = "INSTRUMENT=-O0 --coverage -fprofile-update=single"
-    subprocess.run(["make", "-s", "-C", str(ROOT / "firmware"), "native", f"OUT={BUILD}", instrument], check=True)
+    out = os.path.relpath(BUILD, ROOT / "firmware")
+    subprocess.run(["make", "-s", "-C", str(ROOT / "firmware"), "native", f"OUT={out}", instrument], check=True)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     # The loops of `corrupt` assert no more than the tests do, and would cover a line that no test looks at.
     command += ["-k", "not damaged_and_repeated", *(str(ROOT / "tests" / "firmware" / name) for name in TESTS)]

@@ -26,6 +26,26 @@ def test_builds_for_the_mega_and_is_small():
     assert data + bss < 2_000  # of 8 KiB; the rest is for the stack
 
 
+@pytest.mark.skipif(shutil.which("gcc") is None or shutil.which("make") is None, reason="needs gcc and make")
+def test_builds_in_a_folder_of_any_name(tmp_path):
+    root = tmp_path / "My (d)rive's & x : $HOME %"
+    for part in ("firmware", "tests/firmware", "tools/fuzz"):
+        shutil.copytree(FIRMWARE.parent / part, root / part)
+    command = ["make", "-C", str(root / "firmware"), "../build/firmware/libslew.so"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (root / "build" / "firmware" / "libslew.so").is_file()
+
+
+@pytest.mark.parametrize("setting", ["OUT=/tmp/My Drive", "ARDUINO=/tmp/a:b"])
+def test_a_path_that_make_cannot_hold_is_one_line(setting):
+    command = ["make", "-C", str(FIRMWARE), "--no-print-directory", setting]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert f"{setting}: make takes no path with spaces or colons" in done.stderr
+
+
 @pytest.mark.parametrize("name", ["frame.c", "output.c", "controller.c"])
 def test_logic_includes_no_hardware(name):
     includes = re.findall(r"#include\s+([<\"].*?[>\"])", (FIRMWARE / name).read_text())
