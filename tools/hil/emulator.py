@@ -104,7 +104,8 @@ def build(board: BoardName, *, firmware: bool = True) -> Path:
     with (folder / f"{board}.lock").open("w") as lock:  # several test runs may want it at once
         fcntl.flock(lock, fcntl.LOCK_EX)
         if board == "simavr" and firmware:
-            _run(("make", "-s", "-C", str(FIRMWARE), f"OUT={os.path.relpath(FIRMWARE_ELF.parent, FIRMWARE)}"), "the firmware does not build")
+            out = os.path.relpath(FIRMWARE_ELF.parent, FIRMWARE)
+            _run(("make", "-s", "-C", str(FIRMWARE), f"OUT={out}"), "the firmware does not build")
         sources = _BOARD_SOURCES[board]
         headers = (*SOURCES.glob("*.h"), *FIRMWARE.glob("*.h"))
         newest = max(path.stat().st_mtime for path in (*sources, *headers))
