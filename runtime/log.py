@@ -221,6 +221,9 @@ def read(folder: Path) -> Run:
     except (OSError, msgspec.DecodeError) as error:
         raise ModelError(f"{folder} is no folder of a run ({error})") from error
     told = [line["acknowledged"] for line in lines if line.get("acknowledged")]
-    acknowledged = {entry["tick"]: entry["ms"] for entry in told}
-    ticks = [{**line, "acknowledged": {"ms": acknowledged.get(line["tick"])}} for line in lines if "tick" in line]
+    try:
+        acknowledged = {entry["tick"]: entry["ms"] for entry in told}
+        ticks = [{**line, "acknowledged": {"ms": acknowledged.get(line["tick"])}} for line in lines if "tick" in line]
+    except (KeyError, TypeError) as error:
+        raise ModelError(f"{folder}: run.jsonl is not the log of a run ({error!r})") from error
     return Run(meta, ticks, [line for line in lines if "event" in line])

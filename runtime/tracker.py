@@ -6,11 +6,8 @@ closed by one thread, since the clients of trackers cannot be used by two.
 
 from __future__ import annotations
 
-import json
 import threading
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -18,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.errors import DeviceAbsent, UsageError
+from modsoft.runtime.errors import UsageError
 from modsoft.runtime.robot import Robot
 
 Array = NDArray[np.float64]
@@ -106,61 +103,6 @@ class Reader:
         self._thread.join(CLOSE_WAIT_S)
 
 
-class Replay:
-    """The frames of a recorded run (`run.jsonl`), at the pace of the record. For rehearsals without a tracker."""
-
-    def __init__(
-        self,
-        path: Path,
-        now: Callable[[], float] = time.monotonic,
-        wait: Callable[[float], object] = time.sleep,
-    ):
-        self._now, self._wait = now, wait
-        path = path / "run.jsonl" if path.is_dir() else path
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise DeviceAbsent(
-                f"tracker source replay: {path} cannot be read ({error}); give a run's folder"
-            ) from error
-        self._frames = list(_recorded(text))
-        if not self._frames:
-            raise DeviceAbsent(f"tracker source replay: no frame stands in {path}; give the folder of another run")
-        self._start_s = now()
-        self._next = 0
-
-    def read(self) -> Frame | None:
-        if self._next == len(self._frames):
-            self._wait(0.05)
-            return None
-        at_s, frame = self._frames[self._next]
-        due_s = self._start_s + at_s - self._frames[0][0]
-        if due_s > self._now():
-            self._wait(min(due_s - self._now(), 0.05))
-            return None
-        self._next += 1
-        return Frame(frame.device_frame, due_s, frame.poses, frame.valid, frame.quality)
-
-    def close(self) -> None:
-        self._frames = []
-        self._next = 0
-
-
-def _recorded(text: str) -> Iterator[tuple[float, Frame]]:
-    """(time, frame) of every line that carries a whole one."""
-    for line in text.splitlines():
-        try:
-            seen = json.loads(line).get("frame")
-        except ValueError:
-            continue  # the last line of a run that was killed
-        if not seen:
-            continue
-        poses = np.array(seen["poses"], dtype=np.float64)  # null becomes NaN
-        quality = np.array(seen["quality"], dtype=np.float64)
-        at_s = seen["mono_ns"] * 1e-9
-        yield at_s, Frame(seen["number"], at_s, poses, np.array(seen["valid"], dtype=bool), quality)
-
-
 def port_of(robot: Robot, folder: Path) -> str:
     """The port under [tracker]; a recorded run's path starts from `folder`, that of the robot file."""
     tracker = robot.tracker
@@ -180,6 +122,8 @@ def open_source(robot: Robot, port: str, tools: list[Path]) -> Source:
 
             return NDI(settings.type, port, tools, robot.modules + 1)
         case "replay":
-            return Replay(Path(port))
+            from modsoft.runtime.replay import Replay
+
+            return Replay(Path(port), robot.modules + 1)
         case _:
             raise UsageError(f"tracker source {settings.source!r} cannot be read yet; use ndi or replay")

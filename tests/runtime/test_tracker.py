@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from modsoft.runtime import ndi
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import DeviceAbsent, UsageError
-from modsoft.runtime.tracker import Frame, Reader, Replay, Slot, open_source
+from modsoft.runtime.replay import Replay
+from modsoft.runtime.tracker import Frame, Reader, Slot, open_source
 
 ROBOT = robots.load("pneumatic-3")
 
@@ -119,7 +120,7 @@ def test_replay_gives_the_frames_at_their_pace(tmp_path):
         assert 0 < seconds <= 0.05
         clock[0] += seconds
 
-    source = Replay(recorded(tmp_path, [7, None, 9]), lambda: clock[0], wait)
+    source = Replay(recorded(tmp_path, [7, None, 9]), 4, lambda: clock[0], wait)
     got = []
     for _ in count():
         seen = source.read()
@@ -132,11 +133,11 @@ def test_replay_gives_the_frames_at_their_pace(tmp_path):
 
 
 def test_replay_of_nothing(tmp_path):
-    with pytest.raises(DeviceAbsent, match=r"cannot be read.*give a run's folder"):
-        Replay(tmp_path)
+    with pytest.raises(DeviceAbsent, match=r"cannot be read.*give the folder of a run"):
+        Replay(tmp_path, 4)
     (tmp_path / "run.jsonl").write_text("{}\n")
     with pytest.raises(DeviceAbsent, match="no frame"):
-        Replay(tmp_path)
+        Replay(tmp_path, 4)
 
 
 def with_tracker(**changes):
