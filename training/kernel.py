@@ -6,16 +6,18 @@ import ctypes
 import functools
 import importlib.util
 import math
+import os
 from typing import Literal
 
 import numpy as np
 
-from modsoft.runtime.errors import ModsoftError
+from modsoft.runtime.errors import ModsoftError, UsageError
 from modsoft.training.robots import Plant
 
 Damping = Literal["exponential", "explicit"]
 
 VARIANTS = ("plain", "avx2", "avx512")  # by the instructions they need
+LIMIT = "MODSOFT_KERNEL"  # environment variable: the highest variant to use; unset or empty: no limit
 MOST_ACTUATORS = 4
 
 
@@ -69,9 +71,17 @@ def library() -> ctypes.CDLL | None:
 
 
 def variants() -> list[str]:
-    """The variants of the kernel that this processor can run, the fastest last; empty without a kernel."""
+    """The variants of the kernel that run here, the fastest last; empty without a kernel.
+
+    These are the ones that the processor has, up to the one that the environment variable `MODSOFT_KERNEL` names. A
+    limit above what the processor has changes nothing. `UsageError` if it names no variant.
+    """
+    limit = os.environ.get(LIMIT) or VARIANTS[-1]
+    if limit not in VARIANTS:
+        raise UsageError(f"{LIMIT} is {limit!r}, expected {', '.join(VARIANTS)}; unset it to use the fastest")
     found = library()
-    return [] if found is None else [name for i, name in enumerate(VARIANTS) if found.fleet_lanes(i)]
+    allowed = VARIANTS[: VARIANTS.index(limit) + 1]
+    return [] if found is None else [name for i, name in enumerate(allowed) if found.fleet_lanes(i)]
 
 
 def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct:

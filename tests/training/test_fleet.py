@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modsoft.runtime.errors import ModsoftError
+from modsoft.runtime.errors import ModsoftError, UsageError
 from modsoft.training import fleet, kernel
 from modsoft.training.arm import Arm
 from modsoft.training.fleet import Arms, Fleet
@@ -235,6 +235,26 @@ def test_wrong_shapes_and_periods_are_refused():
         robots.step(np.zeros((3, 2, 2)), period_s=1.1e-4)
     with pytest.raises(ModsoftError, match="expected one of"):
         Fleet("cable", 2, 3, variant="mmx")
+
+
+@needs_kernel
+@pytest.mark.parametrize("limit", kernel.VARIANTS)
+def test_the_environment_limits_the_variant(monkeypatch, limit):
+    monkeypatch.delenv(kernel.LIMIT, raising=False)
+    runnable = kernel.variants()
+    monkeypatch.setenv(kernel.LIMIT, "")
+    assert kernel.variants() == runnable
+    monkeypatch.setenv(kernel.LIMIT, limit)
+    allowed = [name for name in runnable if kernel.VARIANTS.index(name) <= kernel.VARIANTS.index(limit)]
+    assert kernel.variants() == allowed
+    assert Fleet("cable", 2, 1).lanes == kernel.library().fleet_lanes(kernel.VARIANTS.index(allowed[-1]))
+
+
+def test_a_limit_that_is_no_variant_is_refused_in_one_line(monkeypatch):
+    monkeypatch.setenv(kernel.LIMIT, "AVX-2")
+    with pytest.raises(UsageError, match=r"^MODSOFT_KERNEL is 'AVX-2', expected plain, avx2, avx512; .*") as refused:
+        kernel.variants()
+    assert "\n" not in str(refused.value)
 
 
 def test_pyelastica_serves_where_the_kernel_is_missing(monkeypatch, capsys):
