@@ -3,6 +3,7 @@
 What tests of several parts share stands in tests/shared, importable by its file's name.
 """
 
+import importlib.util
 import sys
 from pathlib import Path
 
@@ -14,6 +15,15 @@ sys.path.insert(0, str(Path(__file__).parent / "shared"))
 # A busy machine is no defect: what is judged against the wall clock says so with a marker.
 settings.register_profile("modsoft", deadline=None)
 settings.load_profile("modsoft")
+
+
+def pytest_configure():
+    """A copied checkout whose .venv still belongs to the original would test the original."""
+    if (spec := importlib.util.find_spec("modsoft.runtime.errors")) is None or spec.origin is None:
+        raise pytest.UsageError(f"{sys.executable} has no modsoft: make install")
+    installed, here = Path(spec.origin).resolve().parents[1], Path(__file__).resolve().parents[1]
+    if installed != here and (installed / "pyproject.toml").is_file():
+        raise pytest.UsageError(f"{sys.executable} has modsoft from {installed}, not from {here}: make install")
 
 
 @pytest.fixture(scope="session")

@@ -50,7 +50,23 @@ if [ -n "$missing" ]; then
     fi
 fi
 
+here=$(pwd -P)
+case $here in
+*:*)
+    echo "install: $here: Python's environments take no folder with a colon in its path; move the checkout" >&2
+    exit 69
+    ;;
+*[\$\`\"]*)
+    echo "install: $here: .venv/bin/activate does not work below such a name; call .venv/bin/modsoft-... instead" >&2
+    ;;
+esac
+existing=""
+[ ! -d .venv ] || existing=yes
 [ -x .venv/bin/python ] || "$python" -m venv .venv
+if [ -n "$existing" ] && [ "$(cat .venv/.installed 2>/dev/null)" != "$here" ]; then
+    .venv/bin/python tools/move_environment.py .venv # it came with a checkout that was copied or moved
+fi
 echo "install: Python packages into .venv"
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --use-pep517 -c constraints.txt -e '.[dev]'
+printf '%s\n' "$here" >.venv/.installed
 echo "install: done"

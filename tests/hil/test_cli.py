@@ -89,7 +89,7 @@ def test_an_interrupted_run_leaves_its_traces_and_the_next_one_replaces_them(tmp
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path, order):
-    with report_folder.claimed(tmp_path / "out"), pytest.raises(InUse, match="another modsoft-hil writes to it"):
+    with report_folder.claimed(tmp_path / "out"), pytest.raises(InUse, match="another modsoft-hil works on it"):
         order()
 
 

@@ -4,12 +4,12 @@ replaces or deletes a file that it did not write."""
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from modsoft.runtime.errors import InUse, OutputError, UsageError
+from modsoft.runtime.errors import OutputError, UsageError
+from modsoft.runtime.locks import locked
 
 FINISHED = "report.json"  # written last: where it exists, the other files are complete
 MARKER = ".modsoft-hil"
@@ -42,20 +42,16 @@ def claimed(folder: Path) -> Iterator[None]:
     """Checks, makes and marks `folder`, deletes what an interrupted run of the rig left in it, and keeps other runs of
     the rig out (`InUse`) for as long as the context lasts."""
     check(folder)
-    with contextlib.ExitStack() as stack:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / MARKER).write_text(MARKER_TEXT, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error.strerror}); choose another --report") from error
+    with locked(folder / f"{MARKER}.lock", folder, "modsoft-hil"):
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            marker = stack.enter_context((folder / MARKER).open("a", encoding="utf-8"))
-            try:
-                fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise InUse(f"{folder}: another modsoft-hil writes to it; give another --report") from error
-            if not marker.tell():
-                marker.write(MARKER_TEXT)
-                marker.flush()
             _clear(folder)
         except OSError as error:
-            raise OutputError(f"{folder}: cannot be written ({error.strerror}); choose another --report") from error
+            raise OutputError(f"{folder}: cannot be cleared ({error.strerror}); choose another --report") from error
         yield
 
 
