@@ -69,6 +69,12 @@ class ProtocolMismatch(ModsoftError):
     exit_code = 76
 
 
+class TargetNotReached(ModsoftError):
+    """A training ended above the validation error that was asked for."""
+
+    exit_code = 77
+
+
 class Tripped(ModsoftError):
     """A limit, a fault of the board or the stop key ended the run."""
 

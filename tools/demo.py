@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from modsoft.hil import report_folder
-from modsoft.runtime.errors import ModsoftError
+from modsoft.runtime.errors import ModsoftError, TargetNotReached
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = Path("demo")
@@ -68,7 +68,9 @@ STAGES = [
     ),
     Stage(
         "train the biLSTM controller",
-        ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--minutes", "3.5"],
+        # To a validation error that controls the robot well within the rig's limits; the time is only a bound.
+        ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--iterations", "1000", "--target-percent", "0.7",
+         "--minutes", "5"],
         CHECKPOINT,
         [str(DATA), *SHARED]
         + [f"training/{name}.py" for name in ("train", "muon", "dataset", "hdf5", "networks", "checkpoint")],
@@ -115,6 +117,8 @@ def make(stage: Stage, number: str) -> int:
     stage.stamp.write_text(digest)  # first, so that an interrupted stage goes on
     started_s = time.monotonic()
     code = run(stage.command)
+    if code == TargetNotReached.exit_code:  # so the next demo starts this stage from the beginning
+        stage.stamp.write_text("missed its target\n")
     print(f"    {time.monotonic() - started_s:.0f} s", flush=True)
     return code
 

@@ -7,6 +7,7 @@ weights, bit for bit, as one that was not (with the same number of threads on th
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import math
 import time
@@ -21,13 +22,12 @@ import numpy as np
 import torch
 
 from modsoft.runtime.configuration import feature_names, labels
-from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.runtime.errors import ModelError, TargetNotReached, UsageError
 from modsoft.runtime.files import check_writable, target_of
 from modsoft.runtime.locks import locked
 from modsoft.training import checkpoint as checkpoints
-from modsoft.training import networks
+from modsoft.training import muon, networks
 from modsoft.training.dataset import DataSet, Windows, split
-from modsoft.training.muon import Optimiser
 
 # What suits a kind of robot: history and batch of Table S1. A hanging robot's last modules hang from a module that
 # hardly moves beside them, so that they are as good as a robot of their own; with the cable robot nothing was gained by
@@ -36,11 +36,13 @@ BY_KIND: dict[str, dict[str, Any]] = {
     "cable": {"history": 5, "batch": 64, "shorter": 0.0},
     "pneumatic": {"history": 10, "batch": 128, "shorter": 0.4},
 }
+CUDA_BATCHES = 4  # times these windows in a step on a GPU, which small batches leave idle
 ACTUATION_RANGE = 2.0  # errors are told in percent of it
 CHECKS = 20  # looks at the validation error in a whole run, each with a checkpoint
 VALIDATED = 4096  # windows that a look at the validation error takes at most
 ROUND_PERCENT = 0.5  # errors below it are weighted as squares, above as they are
 PRECISIONS = ("float32", "bfloat16")
+DEVICES = ("cpu", "cuda")
 PATIENCE = 8  # checks without a better one that end the run: a one-cycle rate is at its best only in the end
 
 
@@ -54,6 +56,7 @@ class Settings:
     shorter: float = 0.0  # share of the steps that take the robot's last modules for a robot of their own
     iterations: int = 6000
     minutes: float | None = None  # of wall clock; the learning rate ends its cycle with whichever ends first
+    target_percent: float | None = None  # validation error, mean of the modules, that ends the run as soon as reached
     rate: float = 3e-3  # peak of the one-cycle learning rate; 0.001 and 0.0003, constant, in Table S1
     dropout: float = 0.0  # between layers; 0.05 makes estimation worse, with 16,000 samples of cable-4 as with 96,000
     layers: int = 4  # Table S1
@@ -62,12 +65,55 @@ class Settings:
     seed: int = 0
     threads: int = 1
     precision: str = "float32"  # of the network's products, one of PRECISIONS
+    device: str = "cpu"  # one of DEVICES
 
     def __post_init__(self) -> None:
         if self.network != "bilstm" and self.shorter:
             raise UsageError(f"--shorter {self.shorter}: the network {self.network} is bound to its number of modules")
         if self.precision not in PRECISIONS:
             raise UsageError(f"precision {self.precision!r}, expected one of {', '.join(PRECISIONS)}")
+        if self.device not in DEVICES:
+            raise UsageError(f"device {self.device!r}, expected one of {', '.join(DEVICES)}")
+
+
+def settings_for(kind: str, options: dict[str, Any]) -> Settings:
+    """The settings of a run: `options` that are not None, else what suits the kind of robot and the device.
+
+    `options` are named as the fields of `Settings`; device "auto" is cuda where there is a GPU. Raises `UsageError` for
+    a device or precision that this machine does not have.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    if given.get("device", "auto") == "auto":
+        given["device"] = "cuda" if torch.cuda.is_available() else "cpu"
+    suited = dict(BY_KIND[kind])
+    if given.get("network", "bilstm") != "bilstm":
+        suited["shorter"] = 0.0
+    if given["device"] == "cuda":
+        suited["batch"] *= CUDA_BATCHES
+    settings = Settings(**{**suited, **given})
+    check_machine(settings)
+    return settings
+
+
+def check_machine(settings: Settings) -> None:
+    """Raises `UsageError` where the device or its units for the precision do not exist on this machine."""
+    if settings.device == "cuda" and not torch.cuda.is_available():
+        raise UsageError("device cuda: torch finds no GPU here; give --device cpu, or install torch for CUDA")
+    if settings.precision == "bfloat16" and not bfloat16_works(settings.device):
+        raise UsageError("precision bfloat16: this machine has no units for it; give --precision float32")
+
+
+@functools.cache
+def bfloat16_works(device: str) -> bool:
+    """Whether `device` trains an LSTM with bfloat16 products. Tried out: what the processor reports and what torch's
+    libraries are allowed to use are two things."""
+    network = torch.nn.LSTM(8, 8, bidirectional=True).to(device)
+    try:
+        with torch.random.fork_rng(), torch.autocast(device, torch.bfloat16):
+            network(torch.zeros(2, 2, 8, device=device))[0].float().sum().backward()
+    except RuntimeError:
+        return False
+    return True
 
 
 class Progress(NamedTuple):
@@ -88,8 +134,8 @@ def one_cycle(share: float, peak: float) -> float:
 
 def fastest_precision() -> str:
     """bfloat16 where the processor has units for its products (AMX): two thirds of the time of a step, or less."""
-    told: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # newer than the oldest torch that will do
-    return "bfloat16" if told.get("amx_bf16") else "float32"
+    units: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # newer than the oldest torch that will do
+    return "bfloat16" if units.get("amx_bf16") and bfloat16_works("cpu") else "float32"
 
 
 def loss_of(estimated: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
@@ -98,12 +144,13 @@ def loss_of(estimated: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
 
 
 def estimation_errors(network: torch.nn.Module, windows: Windows) -> torch.Tensor:
-    """|estimated - true actuation| (W, N, A) in percent of the actuation range."""
+    """|estimated - true actuation| (W, N, A) in percent of the actuation range, on the CPU."""
     network.eval()
+    device = next(network.parameters()).device
     with torch.no_grad():
         pieces = torch.from_numpy(windows.features).split(1024)
-        found = torch.cat([network(piece) for piece in pieces])
-    return (found - torch.from_numpy(windows.targets)).abs() * (100.0 / ACTUATION_RANGE)
+        estimated = torch.cat([network(piece.to(device)).cpu() for piece in pieces])
+    return (estimated - torch.from_numpy(windows.targets)).abs() * (100.0 / ACTUATION_RANGE)
 
 
 def train(
@@ -116,7 +163,12 @@ def train(
     """Trains on all windows of the data sets, which are of one robot, writes the checkpoint `out` and gives it. Each
     data set is split on its own. Where `out` is there already of the same data and settings it
     is given as it is, and a run goes on from `out.resume`; either of others is refused. Sets torch's threads and random
-    state for the whole process. `InUse` while another process trains `out`."""
+    state for the whole process.
+
+    Raises `InUse` while another process trains `out`, and `TargetNotReached` where the run ends above
+    `settings.target_percent`; the model is written all the same.
+    """
+    check_machine(settings)
     check_writable(out)
     out = target_of(out)  # what a run goes on from waits beside a link's target
     with locked(out.with_name(f"{out.name}.lock"), out, "modsoft-train"):
@@ -148,7 +200,7 @@ def _train(
     if settings.network != "bilstm":
         described["modules"] = robot["robot"]["modules"]
     network = networks.build(described)
-    identity = {"data_sha256": data_sha256(data), **asdict(settings)}
+    identity = {"data_sha256": data_sha256(data), "optimizer": muon.DESCRIPTION, **asdict(settings)}
     resume = out.with_name(f"{out.name}.resume")
     if out.exists():
         made = _finished(out, identity)
@@ -156,6 +208,7 @@ def _train(
             if resume.is_file():  # killed between the last two lines below
                 _resumed(resume, identity)
                 resume.unlink()
+        _check_target(made, out, settings)
         return made
     state = _fit(network, training, validation, settings, identity, resume, progress, clock)
     if state["best"] is None or state["best_percent"] > 100.0:  # worse than any guess within the range can be
@@ -193,7 +246,19 @@ def _train(
     }
     checkpoints.save(checkpoint, out)
     resume.unlink(missing_ok=True)
+    _check_target(checkpoint, out, settings)
     return checkpoint
+
+
+def _check_target(checkpoint: dict[str, Any], out: Path, settings: Settings) -> None:
+    """`TargetNotReached` where a finished model errs by more than was asked for."""
+    made, target = checkpoint["provenance"], settings.target_percent
+    if target is not None and made["validation_percent"] > target:
+        raise TargetNotReached(
+            f"{out}: validation error {made['validation_percent']:.2f} % after {made['iterations_done']} iterations "
+            f"and {made['seconds'] / 60:.1f} minutes, expected at most {target:g} %; the model is kept, but give more "
+            "--minutes, --iterations or data before it controls a robot"
+        )
 
 
 def data_sha256(data: Sequence[DataSet]) -> str:
@@ -226,30 +291,33 @@ def _fit(
 ) -> dict[str, Any]:
     """The loop. Leaves the state of its end in the file `resume` and gives it: `best` weights, `best_percent`,
     `iteration`, `elapsed_s` and what it takes to go on."""
-    features, targets = torch.from_numpy(training.features), torch.from_numpy(training.targets)
+    device = settings.device
+    dropout_random = torch.cuda if device == "cuda" else torch
+    features, targets = (torch.from_numpy(each).to(device) for each in (training.features, training.targets))
     looked_at = validation.evenly(VALIDATED)
-    optimiser = Optimiser(network)
+    network.to(device)
+    optimiser = muon.Optimiser(network)
     state: dict[str, Any] = {"identity": identity, "iteration": 0, "elapsed_s": 0.0}
     state |= {"best": None, "best_percent": math.inf, "worse": 0}
     if resume.is_file():
         state = _resumed(resume, identity)
         network.load_state_dict(state["weights"])
         optimiser.load_state_dict(state["optimiser"])
-        torch.set_rng_state(state["random_state"])
+        dropout_random.set_rng_state(state["random_state"])
 
     per_epoch = -(-len(training) // settings.batch)
     iteration = first = state["iteration"]
     began_s = clock() - state["elapsed_s"]
     order = np.zeros(0, dtype=np.int64)
     share = _share(iteration, clock() - began_s, settings)
-    while share < 1.0 and state["worse"] < PATIENCE:
+    while share < 1.0 and state["worse"] < PATIENCE and not _reached(state["best_percent"], settings):
         epoch, step = divmod(iteration, per_epoch)
         if step == 0 or iteration == first:
             order = np.random.default_rng([settings.seed, epoch]).permutation(len(training))
-        rows = torch.from_numpy(order[step * settings.batch : (step + 1) * settings.batch])
+        rows = torch.from_numpy(order[step * settings.batch : (step + 1) * settings.batch]).to(device)
         modules = _modules_of_step(targets.shape[1], settings, iteration)
         network.train()
-        with torch.autocast("cpu", torch.bfloat16, enabled=settings.precision == "bfloat16"):
+        with torch.autocast(device, torch.bfloat16, enabled=settings.precision == "bfloat16"):
             estimated = network(last_modules(features[rows], modules))
         loss = loss_of(estimated.float(), targets[rows, -modules:])
         loss.backward()
@@ -263,7 +331,7 @@ def _fit(
         if _checks_due(share) > _checks_due(before):
             percent = float(estimation_errors(network, looked_at).mean())
             if percent < state["best_percent"]:
-                weights = {name: value.clone() for name, value in network.state_dict().items()}
+                weights = {name: value.detach().to("cpu", copy=True) for name, value in network.state_dict().items()}
                 state.update(best=weights, best_percent=percent, worse=0)
             else:
                 state["worse"] += 1
@@ -272,7 +340,7 @@ def _fit(
                 elapsed_s=clock() - began_s,
                 weights=network.state_dict(),
                 optimiser=optimiser.state_dict(),
-                random_state=torch.get_rng_state(),
+                random_state=dropout_random.get_rng_state(),
             )
             checkpoints.save(state, resume)
     return state
@@ -281,8 +349,13 @@ def _fit(
 def last_modules(features: torch.Tensor, modules: int) -> torch.Tensor:
     """The last `modules` of a robot's features (W, N, F), labelled as a robot of that many (eq. 1)."""
     last = features[:, -modules:].clone()
-    last[..., -1] = torch.from_numpy(labels(modules))
+    last[..., -1] = torch.from_numpy(labels(modules)).to(last)
     return last
+
+
+def _reached(percent: float, settings: Settings) -> bool:
+    """Whether a validation error, percent, ends the run."""
+    return settings.target_percent is not None and percent <= settings.target_percent
 
 
 def _modules_of_step(modules: int, settings: Settings, iteration: int) -> int:

@@ -26,7 +26,17 @@ from modsoft.runtime.files import check_not_input, check_writable, target_of
 )
 @click.option("--iterations", default=6000, type=click.IntRange(1), help="Steps of the optimiser.")
 @click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Time that ends the run if it is first.")
-@click.option("--batch", type=click.IntRange(1), help="Windows in a step.  [default: 64 cable, 128 pneumatic]")
+@click.option(
+    "--target-percent",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Validation error, percent of the actuation range, that ends the run once reached; a run that ends above "
+    "it exits with 77.",
+)
+@click.option(
+    "--batch",
+    type=click.IntRange(1),
+    help="Windows in a step.  [default: 64 cable, 128 pneumatic; 4 times as many on a GPU]",
+)
 @click.option("--rate", default=3e-3, type=click.FloatRange(0, 1e6, min_open=True), help="Peak learning rate.")
 @click.option("--dropout", default=0.0, type=click.FloatRange(0, 1, max_open=True), help="Between the layers.")
 @click.option(
@@ -48,6 +58,12 @@ from modsoft.runtime.files import check_not_input, check_writable, target_of
     default="float32",
     type=click.Choice(["float32", "bfloat16"]),
     help="Of the network's products. bfloat16: as good, and faster on processors with AMX, by half or more.",
+)
+@click.option(
+    "--device",
+    default="auto",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    help="auto: a GPU where torch finds one, else the CPU.",
 )
 @click.option("--threads", default=1, type=click.IntRange(1), help="Cores; more than are free is far slower than one.")
 def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
@@ -77,11 +93,7 @@ def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
     from modsoft.training import dataset, train
 
     data = [dataset.read(path) for path in data_files]
-    told = {name: value for name, value in options.items() if value is not None}
-    suited = train.BY_KIND[data[0].robot.robot.kind]
-    if options["network"] != "bilstm":
-        suited = {**suited, "shorter": 0.0}
-    settings = train.Settings(**{**suited, **told})
+    settings = train.settings_for(data[0].robot.robot.kind, options)
     began_s, first, smooth = time.monotonic(), None, 0.0
     shown = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
     with tqdm(total=100, desc="train", bar_format=shown, disable=is_there) as bar:

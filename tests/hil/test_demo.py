@@ -114,6 +114,16 @@ def test_a_failed_stage_is_made_again(demo):
     assert demo.ran == ["tool", "tool"]
 
 
+def test_a_network_that_has_not_learned_enough_is_never_exported_and_trained_from_the_start_again(demo):
+    demo.exit_code = 77
+    assert demo.make(stage(demo), "[1/1]") == 77
+    demo.exit_code = 0
+    (demo.FOLDER / "result.resume").write_text("of the first training")
+    assert demo.make(stage(demo), "[1/1]") == 0
+    assert demo.ran == ["tool", "tool"]
+    assert not (demo.FOLDER / "result.resume").exists()
+
+
 def test_the_stages_hang_together(demo):
     """What a stage makes is what the next one depends on, and the files of the project that they name exist."""
     for before, after in zip(demo.STAGES, demo.STAGES[1:], strict=False):
@@ -127,7 +137,7 @@ def test_the_stages_hang_together(demo):
 # What a stage runs, and what of that shapes no result: messages, the command line, who works where.
 ENTRIES = {"modsoft-collect": "training/collect.py", "modsoft-train": "training/train.py",
            "modsoft-export": "export/write.py"}  # fmt: skip
-SHAPELESS = {f"runtime/{name}.py" for name in ("errors", "command", "explain", "files")} | {
+SHAPELESS = {f"runtime/{name}.py" for name in ("errors", "command", "explain", "files", "locks")} | {
     "training/workers.py", "training/coverage.py"}  # fmt: skip
 
 

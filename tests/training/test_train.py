@@ -9,7 +9,7 @@ import torch
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import feature_names, from_angles_deg
-from modsoft.runtime.errors import InUse, ModelError, UsageError
+from modsoft.runtime.errors import InUse, ModelError, TargetNotReached, UsageError
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import dataset, train
 
@@ -74,6 +74,7 @@ def test_a_precision_that_there_is_not_is_refused():
         dataclasses.replace(SMALL, precision="half")
 
 
+@pytest.mark.skipif(not train.bfloat16_works("cpu"), reason="the processor has no units for bfloat16")
 def test_it_learns_as_well_with_products_of_bfloat16(tmp_path):
     settings = dataclasses.replace(SMALL, iterations=600, rate=0.01)
     errors = {}
@@ -84,6 +85,66 @@ def test_it_learns_as_well_with_products_of_bfloat16(tmp_path):
         errors[precision] = np.mean(found["provenance"]["errors_percent"])
     assert 0.0 < abs(errors["bfloat16"] - errors["float32"]) < 1.0
     assert max(errors.values()) < 5.0
+
+
+def test_a_precision_or_device_that_the_machine_does_not_have_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setattr(train, "bfloat16_works", lambda device: False)
+    with pytest.raises(UsageError, match="precision bfloat16: this machine has no units for it; give --precision"):
+        train.settings_for("cable", {"precision": "bfloat16"})
+    assert train.fastest_precision() == "float32"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(UsageError, match="device cuda: torch finds no GPU"):
+        train.train([make()], tmp_path / "model.pt", dataclasses.replace(SMALL, device="cuda"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert train.settings_for("cable", {"device": "auto", "rate": None}) == train.Settings(5, batch=64)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    found = train.settings_for("pneumatic", {"device": "auto"})
+    assert (found.device, found.batch, found.shorter) == ("cuda", 512, 0.4)
+    found = train.settings_for("pneumatic", {"device": "cpu", "network": "lstm", "history": 7})
+    assert (found.device, found.batch, found.shorter, found.history) == ("cpu", 128, 0.0, 7)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_a_gpu_gives_the_same_model_within_rounding(tmp_path):
+    found = {}
+    for device in train.DEVICES:
+        settings = dataclasses.replace(SMALL, device=device, iterations=100, rate=0.01)
+        found[device] = train.train([make(20)], tmp_path / f"{device}.pt", settings)["weights"]
+        assert {value.device.type for value in found[device].values()} == {"cpu"}
+    for name, value in found["cpu"].items():
+        torch.testing.assert_close(found["cuda"][name], value, atol=0.01, rtol=0.01)
+
+
+def test_a_run_ends_as_soon_as_its_target_is_reached(tmp_path):
+    steps = []
+    settings = dataclasses.replace(SMALL, iterations=600, rate=0.01, target_percent=10.0)
+    found = train.train([make(20)], tmp_path / "model.pt", settings, steps.append)["provenance"]
+    assert found["validation_percent"] <= 10.0
+    assert found["iterations_done"] == len(steps) < 600
+    assert steps[-1].validation_percent > 10.0, "the check after that step is the first that reaches it"
+
+
+def test_a_run_that_misses_its_target_keeps_its_model_and_says_so_each_time(tmp_path):
+    out = tmp_path / "model.pt"
+    settings = dataclasses.replace(SMALL, target_percent=0.01)
+    for _ in range(2):
+        with pytest.raises(TargetNotReached, match=r"validation error .* % after 60 iterations .* at most 0.01 %"):
+            train.train([make()], out, settings)
+        assert list(tmp_path.iterdir()) == [out]
+        assert checkpoints.load(out)["provenance"]["iterations_done"] == 60
+
+
+def test_a_cut_run_of_another_optimizer_is_refused(tmp_path, monkeypatch):
+    out = tmp_path / "model.pt"
+    with pytest.raises(Cut):
+        train.train([make()], out, SMALL, cut_at(7))
+    monkeypatch.setattr(train.muon, "DESCRIPTION", "another")
+    with pytest.raises(ModelError, match=r"model.pt.resume: of a run with optimizer muon.*, asked for another"):
+        train.train([make()], out, SMALL)
 
 
 @pytest.mark.parametrize("network", ["lstm", "module-lstm"])

@@ -1,5 +1,6 @@
 """modsoft-train as a command, killed for real."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -22,8 +23,11 @@ def command(folder: Path, *arguments: str) -> list[str]:
     return [sys.executable, "-m", "modsoft.training.train_cli", *arguments]
 
 
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
-    return subprocess.run(command(folder, *arguments), cwd=folder, capture_output=True, text=True, check=False)
+def run(folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        command(folder, *arguments), cwd=folder, capture_output=True, text=True, check=False,
+        env={**os.environ, **environment},
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -82,6 +86,8 @@ def test_the_network_asked_for_is_trained(folder):
         (["d.h5", "--rate", "1e300"], 2, "rate"),
         (["d.h5", "--dropout", "nan"], 2, "--dropout nan"),
         (["d.h5", "--out", "."], 2, "."),
+        (["d.h5", "--target-percent", "0"], 2, "target-percent"),
+        (["d.h5", "--iterations", "2", "--target-percent", "0.1"], 77, "validation error"),
         (["d.h5", "--network", "module-lstm", "--shorter", "0.4"], 2, "bound to its number of modules"),
         ([], 2, "DATASET"),
     ],
@@ -92,8 +98,18 @@ def test_mistakes_end_in_one_clear_line(folder, arguments, code, said):
     assert (found.returncode, found.stdout) == (code, "")
     assert said in found.stderr
     assert "Traceback" not in found.stderr
-    if code != 2:
+    if code not in (2, 77):  # a usage line, or the progress bar, comes before it
         assert found.stderr.count("\n") == 1
+
+
+def test_bfloat16_is_refused_in_one_line_where_the_processor_may_not_use_it(folder):
+    limited = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2"}
+    found = run(folder, "d.h5", "--precision", "bfloat16", **limited)
+    assert (found.returncode, found.stdout) == (2, "")
+    assert found.stderr == (
+        "modsoft-train: precision bfloat16: this machine has no units for it; give --precision float32\n"
+    )
+    assert [path.name for path in folder.iterdir()] == ["d.h5"]
 
 
 def test_help_comes_without_torch(folder):
