@@ -137,7 +137,7 @@ def test_the_stages_hang_together(demo):
 # What a stage runs, and what of that shapes no result: messages, the command line, who works where.
 ENTRIES = {"modsoft-collect": "training/collect.py", "modsoft-train": "training/train.py",
            "modsoft-export": "export/write.py"}  # fmt: skip
-SHAPELESS = {f"runtime/{name}.py" for name in ("errors", "command", "explain", "files", "locks")} | {
+SHAPELESS = {f"runtime/{name}.py" for name in ("errors", "command", "explain", "files", "locks", "ort")} | {
     "training/workers.py", "training/coverage.py"}  # fmt: skip
 
 
