@@ -32,11 +32,14 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
       modsoft-export --inspect model.onnx
 
     \b
-    The TOML for --meta, all but [provenance] required:
+    The TOML for --meta, for weights of another training: a state dict, or a checkpoint that holds one under any key
+    (state_dict, ...), with any prefix before its names and in any float type. All but weights and [provenance] is
+    required:
       robot = "pneumatic-3"            # a robot file, or the name of one that ships
       history = 10                     # time steps T
       label = "base -1, tip +1"        # the one convention that is accepted
       features = "states and actions by time step, then label"
+      weights = "state_dict"           # which, in a checkpoint that holds several
       [provenance]                     # anything worth keeping
     """
     if inspect:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import msgspec
 import torch
 
+from modsoft.export import foreign
 from modsoft.runtime import robot as robots
 from modsoft.runtime.artefact import Network
 from modsoft.runtime.configuration import feature_names
@@ -29,6 +30,7 @@ class MetaFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     history: int
     label: Literal["base -1, tip +1"]
     features: Literal["states and actions by time step, then label"]
+    weights: str | None = None  # which state dict of a checkpoint that holds several, such as "ema.state_dict"
     provenance: dict[str, Any] = {}
 
 
@@ -36,10 +38,8 @@ def read(path: Path, meta: Path | None = None) -> dict[str, Any]:
     """The checkpoint at `path`, checked against itself; with `meta`, one made of a bare state dict."""
     if meta is None:
         content = checkpoints.read(path)
-        if content and all(isinstance(value, torch.Tensor) for value in content.values()):
-            raise ModelError(
-                f"{path}: a bare state dict; its shapes cannot tell {UNTOLD}; say them in a TOML file: --meta FILE"
-            )
+        if len(content.keys() & checkpoints.KEYS.keys()) < len(checkpoints.KEYS) - 1:
+            foreign.refuse(content, path, UNTOLD)
         found = checkpoints.load(path)
     else:
         found = _with_meta(path, meta)
@@ -61,14 +61,11 @@ def _meta(meta: Path) -> MetaFile:
 
 def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
     said = _meta(meta)
-    weights = checkpoints.read(path)
-    if not all(isinstance(value, torch.Tensor) for value in weights.values()):
+    content = checkpoints.read(path)
+    if content.keys() >= checkpoints.KEYS.keys():
         raise ModelError(f"{path}: a checkpoint that says all itself, expected a bare state dict; leave --meta out")
+    weights = foreign.weights_of(content, said.weights, path)
     layers = sum(name.startswith("lstm.weight_hh_l") and not name.endswith("_reverse") for name in weights)
-    needed = ("lstm.weight_ih_l0", "lstm.weight_hh_l0", "head.weight")
-    missing = [name for name in needed if name not in weights or weights[name].ndim != 2]
-    if missing:
-        raise ModelError(f"{path}: no matrix {', '.join(missing)} in it, expected the state dict of the biLSTM")
     beside = meta.parent / said.robot
     robot = robots.load(beside) if beside.exists() else robots.shipped(said.robot)
     return {

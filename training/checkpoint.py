@@ -31,7 +31,8 @@ from modsoft.runtime.files import check_is_file, written
 from modsoft.training import networks
 
 SCHEMA = 1
-KEYS = ("schema", "robot", "network", "features", "weights", "provenance")
+KEYS = {"schema": int, "robot": dict, "network": dict, "features": list, "weights": dict, "provenance": dict}
+OLD_FORMAT = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # how torch.save began before version 1.6
 # What zipfile and torch raise for other files and for damaged ones.
 NOT_READABLE = (OSError, EOFError, RuntimeError, ValueError, LookupError, zipfile.BadZipFile, zlib.error)
 
@@ -53,7 +54,8 @@ def read(path: Path) -> dict[str, Any]:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:  # torch's own message recommends loading it with code and all
         raise ModelError(
-            f"{path}: not a checkpoint of modsoft-train (it holds other than tensors and plain values)"
+            f"{path}: not a checkpoint of modsoft-train (it holds other than tensors and plain values); where it was "
+            "made, save the weights alone: torch.save(network.state_dict(), FILE)"
         ) from error
     except NOT_READABLE as error:
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
@@ -68,6 +70,10 @@ def read(path: Path) -> dict[str, Any]:
 def _check_archive(path: Path) -> None:
     """`ModelError` for a zip archive that is damaged or other than torch.save writes them: one folder, nothing
     compressed, nothing twice, no TorchScript."""
+    with path.open("rb") as file:
+        if file.read(len(OLD_FORMAT)) == OLD_FORMAT:
+            raise ModelError(f"{path}: not a checkpoint of modsoft-train (in the format of torch before 1.6); where it "
+                             "was made, save it again without _use_new_zipfile_serialization=False")  # fmt: skip
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         if damaged := archive.testzip():
@@ -105,6 +111,9 @@ def load(path: Path) -> dict[str, Any]:
         raise ModelError(f"{path}: no {', '.join(missing)} in it, expected a checkpoint of modsoft-train")
     if checkpoint["schema"] != SCHEMA:
         raise ModelError(f"{path}: schema {checkpoint['schema']}, this version reads {SCHEMA}; train it again")
+    wrong = [key for key, kind in KEYS.items() if not isinstance(checkpoint[key], kind)]
+    if wrong or not all(isinstance(value, torch.Tensor) for value in checkpoint["weights"].values()):
+        raise ModelError(f"{path}: {(wrong or ['weights'])[0]} is not what modsoft-train writes; train it again")
     return checkpoint
 
 
