@@ -116,8 +116,10 @@ def written(path: Path, through_links: bool = True) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, target)
     except OSError as error:
+        # Windows refuses to replace a file that is open.
+        advice = "close what has it open" if isinstance(error, PermissionError) else "make room"
         raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}); make room or choose another --out"
+            f"{path}: cannot be written ({error.strerror or error}); {advice} or choose another --out"
         ) from error
     finally:
         with contextlib.suppress(OSError):  # where that fails too, the first error is the one to report

@@ -12,7 +12,7 @@ from typing import Any
 from modsoft.runtime.errors import InUse, OutputError
 
 
-def _module(name: str) -> Any:
+def system_module(name: str) -> Any:
     """A module of the standard library that only some systems have, or None."""
     try:
         return importlib.import_module(name)
@@ -20,7 +20,7 @@ def _module(name: str) -> Any:
         return None
 
 
-fcntl, msvcrt = _module("fcntl"), _module("msvcrt")  # POSIX, Windows
+fcntl, msvcrt = system_module("fcntl"), system_module("msvcrt")  # POSIX, Windows
 
 
 @contextlib.contextmanager

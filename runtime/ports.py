@@ -5,12 +5,12 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
-from typing import NamedTuple, Protocol
-
-import serial
-from serial.tools import list_ports as serial_list_ports
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from modsoft.runtime.errors import DeviceAbsent, PortBusy, UsageError
+
+if TYPE_CHECKING:  # imported where a port is needed: a dry run needs none
+    import serial
 
 # Arduino MEGA 2560: Arduino's own identities, and the older and the Italian maker's numbers.
 MEGA_IDENTITIES = {(0x2341, 0x0042), (0x2341, 0x0010), (0x2341, 0x0242), (0x2A03, 0x0042), (0x2A03, 0x0010)}
@@ -62,6 +62,8 @@ class PortInfo(NamedTuple):
 
 def list_ports() -> list[PortInfo]:
     """The serial ports of this machine, MEGAs first."""
+    from serial.tools import list_ports as serial_list_ports
+
     stable = {}
     if BY_ID.is_dir():
         stable = {str(link.resolve()): str(link) for link in sorted(BY_ID.iterdir())}
@@ -124,6 +126,8 @@ def may_be_mega(name: str) -> bool:
 
 def open_port(name: str, baud: int) -> serial.Serial:
     """Open a port for this program alone. Raises `DeviceAbsent` (not there), `PortBusy` (in use or not permitted)."""
+    import serial
+
     try:
         port = serial.Serial(name, baud, timeout=READ_WAIT_S, write_timeout=WRITE_WAIT_S, exclusive=True)
     except (OSError, ValueError) as error:

@@ -13,6 +13,7 @@ from types import FrameType, TracebackType
 from typing import Any
 
 from modsoft.runtime.errors import ModsoftError, Tripped
+from modsoft.runtime.locks import system_module
 
 STOP_KEYS = (" ", "q", "\x1b")  # space, q, Esc
 # SIGHUP does not exist on Windows.
@@ -105,7 +106,8 @@ class Keys:
         self._restore: Callable[[], None] | None = None
 
     def __enter__(self) -> Keys:
-        read = self._posix() if os.name == "posix" else self._windows()
+        termios, tty, msvcrt = map(system_module, ("termios", "tty", "msvcrt"))
+        read = self._posix(termios, tty) if termios and tty else self._windows(msvcrt) if msvcrt else None
         if read is not None:
             self._thread = threading.Thread(target=self._run, args=(read,), name="keys", daemon=True)
             self._thread.start()
@@ -130,10 +132,7 @@ class Keys:
                 self._stop.request(StopKey("stop key pressed"))
                 return
 
-    def _posix(self) -> Callable[[], str] | None:
-        import termios  # neither exists on Windows
-        import tty
-
+    def _posix(self, termios: Any, tty: Any) -> Callable[[], str] | None:
         if sys.stdin is None:  # closed by whoever started the program
             return None
         try:
@@ -166,15 +165,13 @@ class Keys:
 
         return read
 
-    def _windows(self) -> Callable[[], str] | None:
-        import msvcrt  # exists on Windows only
-
+    def _windows(self, msvcrt: Any) -> Callable[[], str] | None:
         if sys.stdin is None or not sys.stdin.isatty():
             return None
 
         def read() -> str:
-            if msvcrt.kbhit():  # type: ignore[attr-defined]
-                return str(msvcrt.getwch())  # type: ignore[attr-defined]
+            if msvcrt.kbhit():
+                return str(msvcrt.getwch())
             self._done.wait(0.05)
             return ""
 

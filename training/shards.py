@@ -123,7 +123,12 @@ class Shards:
                 shutil.rmtree(path, ignore_errors=True) if path.is_dir() else self._drop(path)
         else:
             trash = self.folder.with_name(f".{self.folder.name}.{socket.gethostname()}.{os.getpid()}.tmp")
-            os.replace(self.folder, trash)
+            try:
+                os.replace(self.folder, trash)
+            except OSError as error:  # Windows refuses while a file in it is open
+                raise OutputError(
+                    f"{self.folder}: cannot be deleted ({error.strerror}); the data set is whole, delete it yourself"
+                ) from error
             shutil.rmtree(trash, ignore_errors=True)
 
 

@@ -1,6 +1,6 @@
-"""Work dealt out to processes, a connection to each.
+"""Work dealt out to processes, with a pipe to each and one back.
 
-A worker whose parent is gone finds its connection closed and ends after the item in hand; concurrent.futures leaves
+A worker whose parent is gone finds its pipe closed and ends after the item in hand; concurrent.futures leaves
 such workers waiting for ever, which a collection that may be killed at any time cannot afford.
 """
 
@@ -17,6 +17,9 @@ from typing import Any, TypeVar
 from modsoft.runtime.errors import INTERNAL_EXIT_CODE, ModsoftError
 
 Item = TypeVar("Item")
+
+# Windows waits for at most 63 things at a time, and multiprocessing uses some itself.
+MOST_JOBS = 60 if os.name == "nt" else 10_000
 
 
 class WorkerLost(ModsoftError):
@@ -37,27 +40,30 @@ def run(task: Callable[[Item], None], items: list[Item], jobs: int) -> Iterator[
     # spawn: a fork would copy the locks of whatever threads run here
     context = multiprocessing.get_context("spawn")
     processes = []
-    busy: list[Connection] = []
+    busy: dict[Connection, Connection] = {}  # where a worker's answers come from: where its items go
     try:
         with _environment():
-            for _ in range(min(jobs, len(items))):
-                ours, theirs = context.Pipe()
-                process = context.Process(target=_work, args=(task, theirs), daemon=True)
+            for _ in range(min(jobs, len(items), MOST_JOBS)):
+                # one-way pipes: a pair for both ways is a socket of a kind that not every system has
+                its_items, to_worker = context.Pipe(duplex=False)
+                from_worker, its_answers = context.Pipe(duplex=False)
+                process = context.Process(target=_work, args=(task, its_items, its_answers), daemon=True)
                 process.start()
-                theirs.close()
+                its_items.close()
+                its_answers.close()
                 processes.append(process)
-                ours.send(next(waiting))
-                busy.append(ours)
+                _send(to_worker, next(waiting))
+                busy[from_worker] = to_worker
         while busy:
-            ready = wait(busy)
-            for connection in [each for each in busy if each in ready]:
-                item = _answer(connection)
+            ready = wait(list(busy))
+            for from_worker in [each for each in busy if each in ready]:
+                item = _answer(from_worker)
                 following = next(waiting, None)
                 if following is None:
-                    busy.remove(connection)
-                    connection.close()
+                    busy.pop(from_worker).close()
+                    from_worker.close()
                 else:
-                    connection.send(following)
+                    _send(busy[from_worker], following)
                 yield item
     finally:
         for process in processes:
@@ -66,27 +72,38 @@ def run(task: Callable[[Item], None], items: list[Item], jobs: int) -> Iterator[
             process.join()
 
 
-def _answer(connection: Connection) -> Any:
-    try:
-        answer = connection.recv()
-    except (EOFError, ConnectionResetError):
-        raise WorkerLost("a worker process died (killed, or out of memory); run again to go on") from None
+def _send(to_worker: Connection, item: Any) -> None:
+    with _lost_if_broken():
+        to_worker.send(item)
+
+
+def _answer(from_worker: Connection) -> Any:
+    with _lost_if_broken():
+        answer = from_worker.recv()
     if isinstance(answer, Exception):
         raise answer
     return answer
 
 
-def _work(task: Callable[[Any], None], connection: Connection) -> None:
+@contextmanager
+def _lost_if_broken() -> Iterator[None]:
+    try:
+        yield
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        raise WorkerLost("a worker process died (killed, or out of memory); run again to go on") from None
+
+
+def _work(task: Callable[[Any], None], items: Connection, answers: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent decides
     try:
         while True:
-            item = connection.recv()
+            item = items.recv()
             try:
                 task(item)
             except Exception as error:  # noqa: BLE001 - raised again by the parent, whatever it is
-                connection.send(error)
+                answers.send(error)
                 return
-            connection.send(item)
+            answers.send(item)
     except (EOFError, BrokenPipeError):  # the parent is gone or has no more
         return
 

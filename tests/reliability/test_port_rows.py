@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(bool(missing), reason=f"simavr needs {' '.join(m
 
 def test_row_07_plugged_in_again_under_another_name(matrix_row, tmp_path, monkeypatch):
     where = {}  # serial number: device, as the operating system would list them
-    monkeypatch.setattr(ports.serial_list_ports, "comports", lambda: [mega(*item) for item in where.items()])
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [mega(*item) for item in where.items()])
 
     def attempt(number):
         serial_number = f"7523733353635180{number:04}"
@@ -236,7 +236,7 @@ def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypat
         refused("of another device", name, DeviceAbsent, 69)
     with stranger("") as name:
         mute = SimpleNamespace(device=name, description="Scale", vid=0x0B95, pid=1, serial_number=None)
-        monkeypatch.setattr(ports.serial_list_ports, "comports", lambda: [mute])
+        monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [mute])
         refused("of a mute device of another maker", name, DeviceAbsent, 69)
     worst = max(took_s, key=took_s.get)
     matrix_row(24, fault=f"port {', '.join(took_s)}", tries=len(took_s), limit="own exit code in 3 s, no retry storm",

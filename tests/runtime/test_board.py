@@ -220,7 +220,7 @@ def test_ports_are_listed_megas_first_and_by_their_lasting_name(monkeypatch, tmp
     (by_id / "usb-Arduino_MEGA").symlink_to(devices[2])
     identities = ((None, None), (0x0403, 0x6001), (0x2A03, 0x42))
     found = [FakePort(str(device), *identity) for device, identity in zip(devices, identities, strict=True)]
-    monkeypatch.setattr(ports.serial_list_ports, "comports", lambda: found)
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: found)
     monkeypatch.setattr(ports, "BY_ID", by_id)
     mega, adapter, plain = ports.list_ports()
     assert (mega.name, mega.device, mega.is_mega) == (str(by_id / "usb-Arduino_MEGA"), str(devices[2]), True)

@@ -4,6 +4,7 @@ import io
 import os
 import signal
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -112,6 +113,44 @@ def test_other_keys_are_no_stop(terminal):
 class Terminal(io.StringIO):
     def isatty(self):
         return True
+
+
+@pytest.fixture
+def console(monkeypatch):
+    """Windows: no termios, and a console of which msvcrt gives the keys in the list."""
+    keys = []
+    msvcrt = SimpleNamespace(kbhit=lambda: bool(keys), getwch=lambda: keys.pop(0))
+    monkeypatch.setattr("modsoft.runtime.stop.system_module", {"msvcrt": msvcrt}.get)
+    monkeypatch.setattr("sys.stdin", Terminal())
+    return keys
+
+
+@pytest.mark.parametrize("keys", [" ", "q", "\x1b", "xyq", "\xe0Hq"])
+def test_stop_keys_of_a_windows_console(console, keys):
+    console += keys
+    stop = Stop()
+    with Keys(stop):
+        stop.wait(10)
+    assert isinstance(stop.error, StopKey)
+
+
+def test_keys_of_windows_do_nothing_without_a_console(console, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO("q"))
+    console += "q"
+    stop = Stop()
+    with Keys(stop):
+        pass
+    assert stop.error is None
+    assert console == ["q"]
+
+
+def test_keys_do_nothing_where_a_system_has_no_way_to_read_them(monkeypatch):
+    monkeypatch.setattr("modsoft.runtime.stop.system_module", {}.get)
+    monkeypatch.setattr("sys.stdin", Terminal())
+    stop = Stop()
+    with Keys(stop):
+        pass
+    assert stop.error is None
 
 
 def test_status_line_is_written_over(monkeypatch):

@@ -13,6 +13,8 @@ import click
 
 from modsoft.runtime.command import entry
 from modsoft.runtime.controller import Controller
+from modsoft.runtime.errors import DeviceAbsent
+from modsoft.runtime.locks import system_module
 from modsoft.runtime.trajectory import load_task
 
 if TYPE_CHECKING:
@@ -50,6 +52,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     the emulated board) and plant.jsonl (the simulated robot). Nothing else should keep the processor busy meanwhile.
     A run that is interrupted leaves its traces there and no report; the next one into the folder replaces them.
     """
+    _check_system()
     from tqdm import tqdm
 
     from modsoft.hil import judge, record, report_folder  # after --help: matplotlib takes a second to import
@@ -98,6 +101,16 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     click.echo(f"{verdict}\n{report / 'report.md'}")
     # a run that never began is judged by what the runtime said, not by the figures it could not have
     return found.runtime_exit if found.runtime_exit and not len(found.tick) else verdict.exit_code
+
+
+def _check_system() -> None:
+    """The emulated board and the fake tracker are serial ports on pseudo-terminals; the board is built with Linux's
+    headers."""
+    if not sys.platform.startswith("linux") or not all(map(system_module, ("fcntl", "pty", "tty"))):
+        raise DeviceAbsent(
+            "the rig needs Linux (pseudo-terminals, simavr); run it there, or in WSL or a virtual machine. "
+            "modsoft-runtime --dry-run works here"
+        )
 
 
 def _move_log(rig: Rig, report: Path) -> bool:
