@@ -14,14 +14,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.errors import ModelError, UsageError
-from modsoft.runtime.files import written
-from modsoft.training import dataset
+from modsoft.runtime.errors import ModelError
+from modsoft.training import dataset, plotting
 from modsoft.training.robots import PLANTS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CUBE, SQUARE = 1 / 4, 1 / 25  # edge over the module's length: random data leave few gaps at that size
 
@@ -111,10 +114,12 @@ def line(coverage: Coverage) -> str:
 def draw(found: list[Coverage], out: Path) -> None:
     """A column for each data set: seen from the side, gravity downwards, and if not planar along the axis too. `out` is
     written whole or not at all, in the format of its ending; `UsageError` for one that is none."""
-    from matplotlib.figure import Figure
+    plotting.save(lambda: _figure(found), out, dpi=150)
 
+
+def _figure(found: list[Coverage]) -> Figure:
     views = [(0, 2, "x (mm)", "z (mm)")] + ([] if found[0].planar else [(0, 1, "x (mm)", "y (mm)")])
-    figure = Figure(figsize=(1.0 + 4.2 * len(found), 0.8 + 4.0 * len(views)), layout="constrained")
+    figure = plotting.figure(1.0 + 4.2 * len(found), 0.8 + 4.0 * len(views))
     axes = figure.subplots(len(views), len(found), squeeze=False, sharex=True, sharey="row")
     for column, each in enumerate(found):
         for row, (across, up, across_name, up_name) in enumerate(views):
@@ -129,8 +134,4 @@ def draw(found: list[Coverage], out: Path) -> None:
                 axis.legend(fontsize=7, markerscale=6, loc="upper left")
         if column == 0:
             axes[0, 0].invert_yaxis()  # shared along the row
-    with written(out) as temporary:
-        try:
-            figure.savefig(temporary, dpi=150, format=out.suffix[1:] or "png")
-        except ValueError as error:  # of a format that there is none
-            raise UsageError(f"{out}: the picture cannot be written ({error}); give --out FILE.png") from error
+    return figure

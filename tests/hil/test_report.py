@@ -75,6 +75,17 @@ def test_the_folder_holds_text_figures_and_picture(record, tmp_path):
     assert (tmp_path / "angles.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_picture_that_fails_leaves_the_text(record, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "picture", lambda record: 1 / 0)
+    trouble = report.write(record, judge(record), {}, tmp_path)
+    assert trouble == "angles.png is missing: division by zero"
+    text = (tmp_path / "report.md").read_text()
+    assert trouble in text
+    assert "![" not in text
+    assert json.loads((tmp_path / "report.json").read_text())["verdict"] == "passed"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "report.md"]
+
+
 def test_a_run_that_failed_before_its_first_tick_has_a_report_too(record, tmp_path):
     empty = {
         name: getattr(record, name)[:0]

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import elastica
@@ -26,10 +26,13 @@ import numpy as np
 
 from modsoft.runtime.command import entry
 from modsoft.runtime.errors import DeviceAbsent, ModsoftError
-from modsoft.training import kernel
+from modsoft.training import kernel, plotting
 from modsoft.training.arm import Arm, _Loads, _Simulator
 from modsoft.training.fleet import Fleet
 from modsoft.training.robots import PLANTS, Plant
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 OPERATIONS_PER_ELEMENT = {"cable": 454, "pneumatic": 480}
 ACTIONS = {"cable": 2, "pneumatic": 1}
@@ -187,13 +190,13 @@ def table(result: dict[str, Any]) -> str:
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """Cost over the number of modules, a panel for each kind."""
-    import matplotlib
+    plotting.save(lambda: _figure(result), path, dpi=110)
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
 
+def _figure(result: dict[str, Any]) -> Figure:
     kinds = list(dict.fromkeys(row["kind"] for row in result["rows"]))
-    figure, axes = plt.subplots(1, len(kinds), figsize=(5.2 * len(kinds), 4.2), squeeze=False, layout="constrained")
+    figure = plotting.figure(5.2 * len(kinds), 4.2)
+    axes = figure.subplots(1, len(kinds), squeeze=False)
     for axis, kind in zip(axes[0], kinds, strict=True):
         rows = [row for row in result["rows"] if row["kind"] == kind]
         modules = sorted({row["modules"] for row in rows})
@@ -208,8 +211,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         axis.set_xticks(modules)
         axis.grid(visible=True, which="both", alpha=0.3)
     figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    return figure
 
 
 def compared(kinds: list[str], module_numbers: list[int], periods: int) -> list[dict[str, Any]]:

@@ -55,7 +55,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     _check_system()
     from tqdm import tqdm
 
-    from modsoft.hil import judge, record, report_folder  # after --help: matplotlib takes a second to import
+    from modsoft.hil import judge, record, report_folder  # after --help: their libraries take a second
     from modsoft.hil import report as reports
     from modsoft.hil.emulator import build, choose
     from modsoft.hil.plant import load_robot
@@ -93,7 +93,8 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
         "robot": f"{robot.name}, {robot.modules} modules, {robot.loop.hz:g} Hz",
         "task": f"{task}, {count} control steps",
     }
-    reports.write(found, verdict, about, report)
+    if trouble := reports.write(found, verdict, about, report):
+        click.echo(f"modsoft-hil: {trouble}", err=True)
     for line in [*verdict.acceptances, *verdict.witnesses]:
         click.echo(f"{'ok' if line.ok else 'NO':>4}  {line.name}: {line.found} ({line.limit})")
     if found.runtime_exit:

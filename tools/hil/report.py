@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from modsoft.hil.judge import Acceptance, Verdict, measured_off_deg, tracking_error_deg
 from modsoft.hil.record import Record
@@ -17,6 +16,10 @@ from modsoft.hil.valves import valve_difference
 from modsoft.runtime.configuration import angle_between_deg, bending_angle_deg
 from modsoft.runtime.files import written
 from modsoft.runtime.tally import spread
+from modsoft.training import plotting
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CLOCKS = (
     "Tick lateness and acknowledgement times: the host's CLOCK_MONOTONIC, taken by modsoft-runtime. Valve outputs: the "
@@ -57,9 +60,9 @@ def figures(record: Record) -> dict[str, Any]:
     return figure
 
 
-def write(record: Record, verdict: Verdict, about: dict[str, str], folder: Path) -> None:
+def write(record: Record, verdict: Verdict, about: dict[str, str], folder: Path) -> str:
     """Writes the three files into `folder`, report.json last: where it is, the others are. `about` says what ran, in
-    the order it is shown."""
+    the order it is shown. Returns why there is no picture of the run, if there is none: the text is written anyway."""
     found = figures(record)
     table = [line._asdict() for line in [*verdict.acceptances, *verdict.witnesses]]
     document = {
@@ -69,17 +72,21 @@ def write(record: Record, verdict: Verdict, about: dict[str, str], folder: Path)
         "acceptances": table,
         "figures": found,
     }
+    trouble = ""
     if len(record.tick):
-        with written(folder / "angles.png") as temporary:
-            picture(record).savefig(temporary, dpi=110, format="png")
+        try:
+            plotting.save(lambda: picture(record), folder / "angles.png", dpi=110)
+        except Exception as error:  # noqa: BLE001 - no failure of a picture is worth the report of a whole run
+            trouble = f"angles.png is missing: {' '.join(str(error).split())}"
     with written(folder / "report.md") as temporary:
-        temporary.write_text(text(record, verdict, about, found), encoding="utf-8")
+        temporary.write_text(text(record, verdict, about, found, trouble), encoding="utf-8")
     with written(folder / FINISHED) as temporary:
         temporary.write_text(json.dumps(_plain(document), indent=1) + "\n", encoding="utf-8")
+    return trouble
 
 
-def text(record: Record, verdict: Verdict, about: dict[str, str], found: dict[str, Any]) -> str:
-    """report.md."""
+def text(record: Record, verdict: Verdict, about: dict[str, str], found: dict[str, Any], trouble: str = "") -> str:
+    """report.md; `trouble`: why it has no picture."""
     lines = [f"# {record.robot.name}, task {record.task}: {verdict}", ""]
     lines += [f"- {name}: {value}" for name, value in about.items()]
     if record.runtime_exit:
@@ -90,7 +97,7 @@ def text(record: Record, verdict: Verdict, about: dict[str, str], found: dict[st
     lines += ["", "| did the host keep up? | found | limit | |", "| --- | --- | --- | --- |"]
     lines += [_row(line, False) for line in verdict.witnesses]
     if "tracking_error_deg" in found:
-        lines += ["", "![desired and reached angles](angles.png)", "", *_tracking_table(found)]
+        lines += ["", trouble or "![desired and reached angles](angles.png)", "", *_tracking_table(found)]
     lines += ["", "| | median | 99th percentile | largest |", "| --- | --- | --- | --- |"]
     for name, key in TIMES.items():
         if told := found[key]:
@@ -136,7 +143,7 @@ def picture(record: Record) -> Figure:
     """Angles above, pressures below, one column a module."""
     modules, start = record.robot.modules, record.mono_ns[0]
     at_tick, at_slice = (record.mono_ns - start) * 1e-9, (record.plant_mono_ns - start) * 1e-9
-    figure = Figure(figsize=(5.2 * modules, 7.0), layout="constrained")
+    figure = plotting.figure(5.2 * modules, 7.0)
     panels = figure.subplots(2, modules, sharex=True, squeeze=False)
     channels = {f"{c.module}{c.side}": c.channel for c in record.robot.chambers}
     for module in range(modules):

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from modsoft.runtime.files import written
 from modsoft.study import flights, measure, paper
 from modsoft.study.cells import Cell, cell, pick
 from modsoft.study.folder import Folder
 from modsoft.study.measure import CONTROL, ESTIMATION, Record
 from modsoft.study.plan import CORRECTIONS, MAIN, TASKS, Model, Plan, Run
-from modsoft.training import coverage
+from modsoft.training import coverage, plotting
 from modsoft.training.evaluate import configuration_errors_percent
 
 if TYPE_CHECKING:
@@ -55,22 +55,21 @@ def draw(plan: Plan, folder: Folder) -> None:
     coverage.draw(
         coverage.compare([folder.data("paper"), folder.data("traditional")]), folder.figures / f"{WORKSPACE}.png"
     )
-    made = {
-        "figure-5": estimation(records),
-        "figure-6": paths(folder, lstm, 4),
-        "figure-7": paths(folder, bilstm, 4),
-        "figure-8": paths(folder, bilstm, 6),
-        "figure-s3": errors(records, folder, bilstm, 4),
-        "figure-s4": errors(records, folder, bilstm, 6),
+    drawn = {
+        "figure-5": partial(estimation, records),
+        "figure-6": partial(paths, folder, lstm, 4),
+        "figure-7": partial(paths, folder, bilstm, 4),
+        "figure-8": partial(paths, folder, bilstm, 6),
+        "figure-s3": partial(errors, records, folder, bilstm, 4),
+        "figure-s4": partial(errors, records, folder, bilstm, 6),
     }
-    for name, figure in made.items():
-        with written(folder.figures / f"{name}.png") as temporary:
-            figure.savefig(temporary, dpi=DPI, format="png")
+    for name, draw_figure in drawn.items():
+        plotting.save(draw_figure, folder.figures / f"{name}.png", dpi=DPI)
 
 
 def estimation(records: Sequence[Record]) -> Figure:
     """A panel for each network and data, a group of bars for each module."""
-    figure = _figure(10.0, 3.6)
+    figure = plotting.figure(10.0, 3.6)
     of_table = pick(records, table="1", quantity=ESTIMATION)
     ours = pick(of_table, source="study")
     kinds = list(dict.fromkeys((record["network"], record["data"]) for record in ours))
@@ -108,7 +107,7 @@ def _bars(panel: Axes, modules: list[int], bars: dict[str, tuple[str, list[Cell 
 
 def paths(folder: Folder, model: Model, modules: int) -> Figure:
     """Tasks below each other, modules side by side."""
-    figure = _figure(1.2 + 2.3 * modules, 7.4)
+    figure = plotting.figure(1.2 + 2.3 * modules, 7.4)
     panels = figure.subplots(len(TASKS), modules, squeeze=False)
     for row, task in enumerate(TASKS):
         kept = {each: flights.read(folder.run(Run(model, task, modules, each))) for each in CORRECTIONS}
@@ -133,7 +132,7 @@ def paths(folder: Folder, model: Model, modules: int) -> Figure:
 
 def errors(records: Sequence[Record], folder: Folder, model: Model, modules: int) -> Figure:
     """Tasks below each other: bars by module, and the error over the steps."""
-    figure = _figure(11.0, 8.0)
+    figure = plotting.figure(11.0, 8.0)
     panels = figure.subplots(len(TASKS), 2, squeeze=False, width_ratios=[1.0, 1.2])
     of_table = pick(records, table={4: "2", 6: "3"}[modules], quantity=CONTROL, modules=modules)
     ours = pick(of_table, source="study", network=model.network, data=model.data)
@@ -161,9 +160,3 @@ def errors(records: Sequence[Record], folder: Folder, model: Model, modules: int
     panels[-1, 0].set_xlabel("module")
     panels[-1, 1].set_xlabel("control step")
     return figure
-
-
-def _figure(width_in: float, height_in: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width_in, height_in), layout="constrained")
