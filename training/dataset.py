@@ -3,8 +3,9 @@
     configuration   (E, K + 1, N, 3) [v_x, v_y, v_z], row 0 at rest, row t + 1 reached by the action of row t
     action          (E, K, N, A) in [-1, 1]
 
-Attributes: `RECIPE` (JSON; all that the numbers depend on), `stage_borders` (N + 1 steps within an episode),
-`redrawn` (episodes that were not finite and were drawn again).
+Attributes: `schema` (1), `recipe` (JSON; all that the numbers depend on: at least `robot`, the robot file as plain
+values, and `strategy`, text), `stage_borders` (stages + 1 steps, 0 to K), `redrawn` (episodes that were not finite and
+were drawn again). What a data set means is checked when it is read: `dataset_checks`.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.configuration import episode_features, state_of
-from modsoft.runtime.errors import ModelError, RobotFileError
+from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_is_file, written
 from modsoft.runtime.robot import Robot
+from modsoft.training import dataset_checks as checks
 from modsoft.training.hdf5 import own_array
 
 SCHEMA = 1
@@ -123,62 +125,42 @@ def join(
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[h5py.File, Header]]:
+def _opened(path: Path) -> Iterator[tuple[dict[str, h5py.Dataset], Header]]:
+    """The arrays of a data set, not read yet, and what it reports about itself, checked against their shapes."""
     check_is_file(path, "data set", f"modsoft-collect --out {path} makes one")
     try:
         with h5py.File(path, "r") as file:
-            schema = int(file.attrs["schema"])
+            told = checks.attributes(file.attrs, path)
+            schema = checks.whole_number("schema", told["schema"], path)
             if schema != SCHEMA:
                 raise ModelError(f"{path}: schema {schema}, this version reads {SCHEMA}; collect it again")
-            yield (
-                file,
-                Header(
-                    recipe=json.loads(file.attrs["recipe"]),
-                    stage_borders=np.asarray(file.attrs["stage_borders"], dtype=np.int64),
-                    redrawn=int(file.attrs["redrawn"]),
-                    episodes=len(own_array(file, "action")),
-                ),
-            )
+            arrays = {name: own_array(file, name) for name in ("configuration", "action")}
+            shape = arrays["action"].shape
+            steps = shape[1] if len(shape) == 4 else 0
+            recipe = checks.recipe(told["recipe"], steps, path)
+            robot = robots.from_dict(recipe["robot"], "data set")
+            checks.shapes(arrays["configuration"].shape, shape, robot, path)
+            borders = checks.stage_borders(told["stage_borders"], steps, path)
+            redrawn = checks.whole_number("redrawn", told["redrawn"], path)
+            yield arrays, Header(recipe, borders, redrawn, episodes=shape[0])
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise ModelError(f"{path}: not a data set of modsoft-collect, or damaged ({error})") from error
 
 
 def read_header(path: Path) -> Header:
-    """Reads what a data set says about itself; errors as in `read`."""
+    """Reads what a data set reports about itself; errors as in `read`."""
     with _opened(path) as (_, header):
         return header
 
 
 def read(path: Path) -> DataSet:
-    """Reads a data set; `ModelError` says what was found where it is none, or damaged."""
-    with _opened(path) as (file, header):
-        data = DataSet(
-            recipe=header.recipe,
-            configuration=own_array(file, "configuration")[()],
-            action=own_array(file, "action")[()],
-            stage_borders=header.stage_borders,
-            redrawn=header.redrawn,
-        )
-    _check(data, path)
-    return data
-
-
-def _check(data: DataSet, path: Path) -> None:
-    try:
-        robot = data.robot
-    except (KeyError, TypeError, RobotFileError) as error:  # of this file, not of a robot file that the user can mend
-        raise ModelError(f"{path}: its robot cannot be read ({error}); collect it again") from error
-    episodes, steps = data.action.shape[:2] if data.action.ndim == 4 else (0, 0)
-    expected = {
-        "action": (episodes, steps, robot.modules, robot.action_size),
-        "configuration": (episodes, steps + 1, robot.modules, 3),
-    }
-    for name, shape in expected.items():
-        found = getattr(data, name)
-        if found.shape != shape or found.size == 0:
-            raise ModelError(f"{path}: {name} has the shape {found.shape}, expected {shape}; collect it again")
-        if not np.all(np.isfinite(found)):
-            raise ModelError(f"{path}: {name} holds values that are not finite; collect it again")
+    """Reads a data set of any float type; `ModelError` says what was found where it is none, is damaged, or means
+    something else: configurations that are no unit vectors, actions beyond [-1, 1]."""
+    with _opened(path) as (arrays, header):
+        configuration, action = (np.asarray(arrays[name], np.float64) for name in ("configuration", "action"))
+    checks.configuration(configuration, path)
+    checks.action(action, path)
+    return DataSet(header.recipe, configuration, action, header.stage_borders, header.redrawn)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,6 @@ def own_array(file: h5py.File, name: str) -> h5py.Dataset:
     if found.nbytes > found.id.get_storage_size():
         raise ModelError(
             f"{where} claims {found.nbytes} bytes, the file holds {found.id.get_storage_size()} (compressed, or cut); "
-            "collect it again"
+            "write it without compression, or collect it again"
         )
     return found

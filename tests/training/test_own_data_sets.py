@@ -1,0 +1,173 @@
+"""Data sets that a user wrote from the log of a real robot: what fits is trained on, the rest is one line and 65."""
+
+import json
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.errors import ModelError
+from modsoft.training import collect_cli, dataset, train_cli
+
+E, K, N = 2, 12, 3
+RECIPE = {"robot": robots.load("pneumatic-3").to_dict(), "strategy": "real robot"}
+ANGLES = np.concatenate([np.zeros((E, 1, N)), np.random.default_rng(0).uniform(-0.5, 0.5, (E, K, N))], axis=1)
+ACTION = 2.0 * ANGLES[:, 1:, :, None]
+CONFIGURATION = np.stack([np.sin(ANGLES), 0.0 * ANGLES, np.cos(ANGLES)], axis=-1)
+
+
+def put(values, place, value):
+    """A copy of an array with another value at one place."""
+    changed = values.copy()
+    changed[place] = value
+    return changed
+
+
+def written(path, configuration=CONFIGURATION, action=ACTION, recipe=RECIPE, **attributes):
+    """The file, by h5py alone; an attribute `...` is left out."""
+    with h5py.File(path, "w") as file:
+        for name, values in (("configuration", configuration), ("action", action)):
+            if values is not ...:
+                file[name] = values
+        found = {"schema": 1, "recipe": recipe, "stage_borders": np.array([0, K]), "redrawn": 0} | attributes
+        for name, value in found.items():
+            if value is not ...:
+                file.attrs[name] = json.dumps(value) if isinstance(value, dict | list) else value
+    return path
+
+
+AS_IT_IS = {
+    "float64": {},
+    "float32": {"configuration": CONFIGURATION.astype("f4"), "action": ACTION.astype("f4")},
+    "float16": {"configuration": CONFIGURATION.astype("f2"), "action": ACTION.astype("f2")},
+    "big-endian": {"configuration": CONFIGURATION.astype(">f8"), "action": ACTION.astype(">f8")},
+    "four decimals": {"configuration": CONFIGURATION.round(4)},
+    "recipe as bytes": {"recipe": np.bytes_(json.dumps(RECIPE))},
+    "recipe with a byte order mark": {"recipe": np.bytes_(b"\xef\xbb\xbf" + json.dumps(RECIPE).encode())},
+    "small integers": {"stage_borders": np.array([0, 4, K], "u1"), "schema": np.int8(1), "redrawn": np.array([0])},
+    "an empty stage": {"stage_borders": np.array([0, 0, K])},
+    "period and steps": {"recipe": {**RECIPE, "steps": K, "period_s": 0.4, "seed": None}},
+}
+
+
+@pytest.mark.parametrize("kind", AS_IT_IS)
+def test_what_means_the_same_is_read_as_float64(tmp_path, kind):
+    data = dataset.read(written(tmp_path / "own.h5", **AS_IT_IS[kind]))
+    for found, expected in ((data.configuration, CONFIGURATION), (data.action, ACTION)):
+        assert found.dtype == np.dtype("=f8")
+        np.testing.assert_allclose(found, expected, atol=1e-3)
+    assert data.recipe["strategy"] == "real robot"
+    assert sum(map(len, dataset.split(data, 2, "shuffled", 0))) == E * K
+
+
+BORDERS = "expected whole numbers that rise from 0 to 12, the steps of an episode"
+WRONG = {
+    "degrees": ({"configuration": np.degrees(ANGLES)[..., None] * [1.0, 0, 0]}, "of length 0; expected a unit vector"),
+    "not normalised": (
+        {"configuration": 1.01 * CONFIGURATION},
+        "configuration of episode 0, step 0, module 1 is .* 1.01",
+    ),
+    "one vector": (
+        {"configuration": put(CONFIGURATION, (1, 4, 2), 0.0)},
+        r"episode 1, step 4, module 3 is \[0, 0, 0\]",
+    ),
+    "NaN": (
+        {"configuration": put(CONFIGURATION, (1, 4, 2, 0), np.nan)},
+        "not finite, first in episode 1, step 4, module 3",
+    ),
+    "infinite": ({"action": put(ACTION, (0, 5, 1, 0), np.inf)}, "action holds values that are not finite"),
+    "action 2": ({"action": put(ACTION, (1, 3, 0, 0), -2.0)}, r"a_0 of episode 1, step 3, module 1 is -2; .*\[-1, 1\]"),
+    "percent": ({"action": 100.0 * ACTION}, r"expected actions in \[-1, 1\]"),
+    "complex": ({"configuration": CONFIGURATION.astype(complex)}, "configuration is no array of floats"),
+    "integers": ({"action": np.zeros(ACTION.shape, int)}, "action is no array of floats"),
+    "text": ({"action": np.full(ACTION.shape, b"0.5")}, "action is no array of floats"),
+    "no action": ({"action": ...}, "action is not in it"),
+    "no episode": ({"configuration": CONFIGURATION[:0], "action": ACTION[:0]}, r"\(episodes, steps, 3, 1\) for robot"),
+    "no step": (
+        {"configuration": CONFIGURATION[:, :1], "action": ACTION[:, :0]},
+        r"expected \(episodes, steps, 3, 1\)",
+    ),
+    "as long as actions": ({"configuration": CONFIGURATION[:, 1:]}, r"\(2, 12, 3, 3\), expected \(2, 13, 3, 3\) for"),
+    "fewer episodes": ({"configuration": CONFIGURATION[:1]}, r"\(1, 13, 3, 3\), expected \(2, 13, 3, 3\)"),
+    "two modules": (
+        {"configuration": CONFIGURATION[:, :, :2], "action": ACTION[:, :, :2]},
+        r"expected \(2, 12, 3, 1\) for",
+    ),
+    "flat": ({"action": ACTION[0, 0, 0, 0]}, r"action has the shape \(\), expected \(episodes, steps, 3, 1\)"),
+    "one long run": (
+        {"action": ACTION[0], "configuration": CONFIGURATION[0]},
+        r"the shape \(12, 3, 1\), expected \(ep",
+    ),
+    "no schema": ({"schema": ...}, "no attribute schema, expected a whole number"),
+    "schema 2": ({"schema": 2}, "schema 2, this version reads 1"),
+    "schema text": ({"schema": "1"}, "schema is 1, expected a whole number"),
+    "no recipe": ({"recipe": ...}, "no attribute recipe, expected JSON: robot, strategy"),
+    "recipe in Python": ({"recipe": str(RECIPE)}, "its recipe cannot be read"),
+    "recipe not text": ({"recipe": np.bytes_(b"\xff\xd8")}, "its recipe cannot be read"),
+    "recipe a number": ({"recipe": 1.5}, "its recipe cannot be read"),
+    "recipe a list": ({"recipe": [1]}, "its recipe cannot be read .*Expected `object`, got `array`"),
+    "no strategy": ({"recipe": {"robot": RECIPE["robot"]}}, "missing required field `strategy`"),
+    "strategy 1": ({"recipe": {**RECIPE, "strategy": 1}}, "Expected `str`, got `int` - at `\\$.strategy`"),
+    "no robot": ({"recipe": {"strategy": "x"}}, "missing required field `robot`"),
+    "robot a name": ({"recipe": {**RECIPE, "robot": "pneumatic-3"}}, "at `\\$.robot`"),
+    "robot of nothing": ({"recipe": {**RECIPE, "robot": {}}}, "robot cannot be read"),
+    "another robot": (
+        {"recipe": {**RECIPE, "robot": robots.load("cable-4").to_dict()}},
+        r"expected \(2, 12, 4, 2\) for",
+    ),
+    "other steps": ({"recipe": {**RECIPE, "steps": 150}}, "steps 150 in its recipe, but its episodes have 12"),
+    "negative steps": ({"recipe": {**RECIPE, "steps": -12}}, "steps -12 in its recipe"),
+    "other period": (
+        {"recipe": {**RECIPE, "period_s": 0.1}},
+        "period_s 0.1 in its recipe, but hz of its robot means 0.4",
+    ),
+    "no borders": ({"stage_borders": ...}, "no attribute stage_borders"),
+    "borders short": ({"stage_borders": [0, 5]}, BORDERS),
+    "borders text": ({"stage_borders": "0, 12"}, BORDERS),
+    "no redrawn": ({"redrawn": ...}, "no attribute redrawn"),
+    "redrawn negative": ({"redrawn": -1}, "redrawn is -1, expected a whole number"),
+    "redrawn a fraction": ({"redrawn": 0.5}, "redrawn is 0.5, expected a whole number"),
+    "redrawn nothing": ({"redrawn": h5py.Empty("f8")}, "redrawn"),
+}
+WRONG |= {
+    f"borders {value}": ({"stage_borders": np.array(value)}, BORDERS)
+    for value in (
+        [0, 5], [0, 999], [0], [], K, [K, 0], [1, K], [-3, K], [0, 9, 4, K], [0.0, float(K)], [[0, K]], [0, np.nan],
+        [0, 2**63 + K], [False, True], list(range(200)),
+    )
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_anything_else_is_one_line_when_it_is_read(tmp_path, kind):
+    changes, found = WRONG[kind]
+    path = written(tmp_path / "own.h5", **changes)
+    with pytest.raises(ModelError, match=rf"^[^\n]*own\.h5: [^\n]*{found}[^\n]*$") as error:
+        dataset.read(path)
+    assert error.value.exit_code == 65
+    assert len(str(error.value)) < 400
+
+
+def test_one_step_is_too_few_to_train_on(tmp_path):
+    path = written(
+        tmp_path / "own.h5", CONFIGURATION[:, :2], ACTION[:, :1], stage_borders=np.array([0, 1])
+    )  # fmt: skip
+    with pytest.raises(ModelError, match="2 samples leave none for"):
+        dataset.split(dataset.read(path), 3, "blocks", 0)
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments"),
+    [(train_cli.main, ["own.h5", "--out", "m.pt"]), (collect_cli.main, ["plot", "own.h5", "--out", "picture.png"])],
+)
+def test_the_commands_end_with_65_before_they_begin(tmp_path, monkeypatch, capsys, main, arguments):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "own.h5", recipe={"robot": RECIPE["robot"]})
+    monkeypatch.setattr(sys, "argv", ["command", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    error = capsys.readouterr().err
+    assert (ended.value.code, len(error.splitlines())) == (65, 1), error
+    assert [path.name for path in tmp_path.iterdir()] == ["own.h5"]
