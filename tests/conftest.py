@@ -4,6 +4,7 @@ What tests of several parts share stands in tests/shared, importable by its file
 """
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 
@@ -24,6 +25,17 @@ def pytest_configure():
     installed, here = Path(spec.origin).resolve().parents[1], Path(__file__).resolve().parents[1]
     if installed != here and (installed / "pyproject.toml").is_file():
         raise pytest.UsageError(f"{sys.executable} has modsoft from {installed}, not from {here}: make install")
+
+
+@pytest.fixture(autouse=True)
+def child_imports():
+    """A command that a test runs in this process changes how child processes import; not those of later tests."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    yield
+    if before is None:
+        os.environ.pop("PYTHONSAFEPATH", None)
+    else:
+        os.environ["PYTHONSAFEPATH"] = before
 
 
 @pytest.fixture(scope="session")
