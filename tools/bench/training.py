@@ -11,8 +11,8 @@ thread each:
              constant rate of 0.001; dropout 0.1; the validation error every 500 iterations
 
 A way is done when its validation error, mean over the modules, is at most Table 1's, or when it has taken --give-up
-times as long as ours. Times are processor time of the training process, validation included. The authors' worker works beside
-it on the other core and is not counted. The share of the optimizer in a training step is measured first.
+times as long as ours. Times are processor time of the training process, validation included. The authors' worker works
+beside it on the other core and is not counted. The share of the optimizer in a training step is measured first.
 """
 
 from __future__ import annotations
