@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -125,6 +126,17 @@ def _connected(kind: str, port: str, tools: list[Path]) -> Any:
         """Asks for TX, which every device answers. The binary BX comes through ndicapi as text, and fails as soon as
         a byte of it is no UTF-8: with three tools, for instance (ndicapi's issue 46)."""
 
+        def _connect_network(self, configuration: dict[str, Any]) -> None:
+            """The client calls ping first, to save the time-out of a wrong address; not every machine has it."""
+            if shutil.which("ping"):
+                super()._connect_network(configuration)
+                return
+            self._device = ndicapy.ndiOpenNetwork(configuration["ip address"], configuration["port"])
+            if not self._device:
+                raise OSError("no connection")
+            ndicapy.ndiCommand(self._device, "INIT:")
+            self._check_for_errors("Sending INIT command")
+
         def _set_use_bx_transforms(self) -> None:
             self._get_frame, self._get_transform = ndicapy.ndiGetTXFrame, ndicapy.ndiGetTXTransform
             self._capture_string = "TX:0801"
@@ -149,9 +161,6 @@ def _connected(kind: str, port: str, tools: list[Path]) -> Any:
     try:
         tracker = TextNDI(settings)
         tracker.start_tracking()
-    except FileNotFoundError as error:
-        what = "the command ping, which the client needs for vega" if error.filename == "ping" else str(error)
-        raise DeviceAbsent(f"tracker at {port}: not found: {what}") from error
     except (OSError, ValueError) as error:
         raise DeviceAbsent(
             f"no {kind} tracker answers at {port} ({_one_line(error)}); is it switched on, and is this its port?"

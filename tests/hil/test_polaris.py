@@ -222,14 +222,16 @@ class Rig:
             [sys.executable, "-m", "modsoft.hil.polaris", "--link", str(self.link), *options],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
-        assert json.loads(self.process.stdout.readline())["event"] == "ready"
+        ready = json.loads(self.process.stdout.readline())
+        assert ready["event"] == "ready"
+        self.port = ready["port"]
 
     def send(self, **line):
         self.process.stdin.write(json.dumps(line) + "\n")
         self.process.stdin.flush()
 
-    def connect(self):
-        return NDI("polaris", str(self.link), self.tools, len(self.tools))
+    def connect(self, kind="polaris"):
+        return NDI(kind, self.port, self.tools if kind != "aurora" else [], len(self.tools))
 
     def __enter__(self):
         return self
@@ -297,13 +299,40 @@ def test_real_client_sees_the_faults(tmp_path):
         source.close()
 
 
-def test_real_client_comes_again(tmp_path):
-    with Rig(tmp_path) as rig:
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [("polaris", []), ("vega", ["--type", "vega"]), ("aurora", ["--type", "aurora", "--wired", "4"])],
+)
+def test_real_client_comes_again(kind, options, tmp_path):
+    """To each type that a robot file may have."""
+    with Rig(tmp_path, 4, *options) as rig:
         rig.send(poses=poses(4))
         for _ in range(2):
-            source = rig.connect()
-            read_until(source, lambda frame: frame.valid.all())
+            source = rig.connect(kind)
+            frame = read_until(source, lambda frame: frame.valid.all())
+            np.testing.assert_allclose(frame.poses, poses(4), atol=2e-4)
             source.close()
+
+
+def test_real_client_loses_a_vega_and_finds_it_again(tmp_path):
+    with Rig(tmp_path, 4, "--type", "vega") as rig:
+        rig.send(poses=poses(4))
+        source = rig.connect("vega")
+        read_until(source, lambda frame: frame.valid.all())
+        rig.send(unplug=True)
+        with pytest.raises(DeviceAbsent, match=f"tracker at {rig.port}"):
+            read_until(source, lambda frame: False)
+        source.close()
+        rig.send(unplug=False, poses=poses(4))
+        source = rig.connect("vega")
+        read_until(source, lambda frame: frame.valid.all())
+        source.close()
+
+
+def test_no_vega_at_the_address_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda name: None)  # a machine without ping
+    with pytest.raises(DeviceAbsent, match=r"no vega tracker answers at 127\.0\.0\.1:1 "):
+        NDI("vega", "127.0.0.1:1", write_tool_files(tmp_path, 4), 4)
 
 
 @pytest.mark.realtime

@@ -10,6 +10,7 @@ import pytest
 from processes import descendants
 
 from modsoft.hil.rig import Rig
+from modsoft.runtime import robot as robots
 
 LISTENING = "0A"
 # As the kernel writes 127.0.0.1, ::1 and ::ffff:127.0.0.1.
@@ -49,8 +50,12 @@ def test_a_port_for_everybody_is_seen():
 
 
 @pytest.mark.realtime
-def test_a_run_on_the_rig_listens_nowhere(tmp_path, model_file):
-    with Rig("pneumatic-3", tmp_path, board="native") as rig:
+@pytest.mark.parametrize(("tracker", "ports"), [("aurora", 0), ("vega", 1)])
+def test_a_run_on_the_rig_listens_for_this_machine_alone(tracker, ports, tmp_path, model_file):
+    """A vega is a device of the network, and so is the fake one."""
+    robot = tmp_path / "robot.toml"
+    robot.write_text(robots.text_of("pneumatic-3").replace('type = "polaris"', f'type = "{tracker}"'))
+    with Rig(robot, tmp_path / "out", board="native") as rig:
         rig.run(model_file, "down")
         deadline_s = time.monotonic() + 60
         while not rig.ticks() and rig.runtime.poll() is None and time.monotonic() < deadline_s:
@@ -58,7 +63,8 @@ def test_a_run_on_the_rig_listens_nowhere(tmp_path, model_file):
         running = descendants(os.getpid())
         assert rig.runtime.pid in running
         assert len(running) >= 4, "board, tracker, robot, runtime"
-        assert listening(running) == set()
+        assert len(listening(running)) == ports
+        assert elsewhere(listening(running)) == set()
 
 
 DASK = """

@@ -1,9 +1,10 @@
 """A fake Polaris: an optical tracker of passive tools on a pseudo-terminal, in a process of its own.
 
 `python -m modsoft.hil.polaris --link PATH` makes PATH a serial port that speaks the device's ASCII protocol (and its
-binary `BX` answer) well enough for the unmodified scikit-surgerynditracker. A process of its own, because that client
-holds its interpreter while it looks for a device. Standard input, one JSON object a line, any keys together; its end
-ends the process:
+binary `BX` answer) well enough for the unmodified scikit-surgerynditracker. With `--type vega` it is on a port of the
+network of this machine alone, in place of PATH; with `--type aurora` and `--wired N` it has N wired tools. A process
+of its own, because that client holds its interpreter while it looks for a device. Standard input, one JSON object a
+line, any keys together; its end ends the process:
 
     {"poses": [[4 x 4], ...]}  poses of the tools, base first, mm, in the tracker's frame; the newest is shown
     {"hide": [k, ...]}         tools that are missing from now on (0 is the base); [] shows all again
@@ -17,17 +18,19 @@ ends the process:
     {"mute": true}             no answer to anything
     {"unplug": true}           the port goes away; false brings it back
 
-Standard output, one JSON line each: {"event": "ready", "port": PATH}, {"event": "tracking", "mono_ns"} at every TSTART,
-{"event": "summary", "commands": {name: count}, "frames"} at the end.
+Standard output, one JSON line each: {"event": "ready", "port": PATH or ADDRESS}, {"event": "tracking", "mono_ns"} at
+every TSTART, {"event": "summary", "commands": {name: count}, "frames"} at the end.
 
 Answers take their time on a line of 115200 baud.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
+import socket
 import sys
 import time
 import tty
@@ -40,6 +43,7 @@ import click
 from modsoft.hil.polaris_device import Polaris
 from modsoft.runtime.command import entry
 from modsoft.runtime.errors import UsageError
+from modsoft.runtime.ndi import FRAME_HZ
 
 SECONDS_A_BYTE = 10 / 115200
 
@@ -50,6 +54,10 @@ class Line:
     def __init__(self, link: Path):
         self.link = link
         self.plug()
+
+    @property
+    def address(self) -> str:
+        return str(self.link)
 
     def plug(self) -> None:
         if self.link.exists() and not self.link.is_symlink():
@@ -84,7 +92,59 @@ class Line:
             pass  # nobody reads, as on a real line
 
 
-def serve(device: Polaris, line: Line, say: Callable[[dict[str, Any]], None], stdin: int) -> None:
+class Network:
+    """A port of the network, for this machine alone: the `Line` of a device of type vega. One client at a time."""
+
+    def __init__(self) -> None:
+        self.port = 0
+        self._client: Any = None
+        self._pending = b""
+        self.plug()
+
+    @property
+    def address(self) -> str:
+        return f"127.0.0.1:{self.port}"
+
+    def plug(self) -> None:
+        self._server = socket.create_server(("127.0.0.1", self.port))
+        self.port = self._server.getsockname()[1]
+        self._await_client()
+
+    def unplug(self) -> None:
+        if self._client is not None:
+            self._client.close()
+        self._server.close()
+        self.master = -1
+
+    def commands(self) -> list[bytes]:
+        """Whole commands that have come in; the client may have come or gone instead."""
+        if self._client is None:
+            self._client, _ = self._server.accept()
+            self.master = self._client.fileno()
+            return []
+        try:
+            data = self._client.recv(4096)
+        except ConnectionError:
+            data = b""
+        if not data:
+            self._client.close()
+            self._await_client()
+            return []
+        *whole, self._pending = (self._pending + data).split(b"\r")
+        return whole
+
+    def write(self, answer: bytes) -> None:
+        if self._client is not None:
+            with contextlib.suppress(ConnectionError):
+                self._client.sendall(answer)
+
+    def _await_client(self) -> None:
+        self._client = None
+        self._pending = b""
+        self.master = self._server.fileno()
+
+
+def serve(device: Polaris, line: Line | Network, say: Callable[[dict[str, Any]], None], stdin: int) -> None:
     """Until the standard input ends."""
     pending = b""
     while True:
@@ -121,16 +181,20 @@ def write_tool_files(folder: Path, tools: int) -> list[Path]:
 @click.option("--link", required=True, type=click.Path(path_type=Path), help="Name that the serial port gets.")
 @click.option("--firmware", default="Polaris Spectra Rev 009", show_default=True,
               help='Its version; one that ends in "Rev 007" makes the client ask for TX in place of BX.')  # fmt: skip
-def cli(link: Path, firmware: str) -> None:
+@click.option("--type", "kind", default="polaris", show_default=True, type=click.Choice(list(FRAME_HZ)),
+              help="As in the robot file.")  # fmt: skip
+@click.option("--wired", default=0, help="Tools that are wired to it: aurora.")
+def cli(link: Path, firmware: str, kind: str, wired: int) -> None:
     """A fake optical tracker (started by modsoft-hil)."""
 
     def say(event: dict[str, Any]) -> None:
         sys.stdout.write(json.dumps(event) + "\n")
         sys.stdout.flush()
 
-    device, line = Polaris(firmware=firmware), Line(link)
+    device = Polaris(firmware=firmware, kind=kind, wired=wired)
+    line = Network() if kind == "vega" else Line(link)
     try:
-        say({"event": "ready", "port": str(link)})
+        say({"event": "ready", "port": line.address})
         serve(device, line, say, sys.stdin.fileno())
     finally:
         line.unplug()

@@ -1,9 +1,10 @@
 """The fake Polaris without its line: commands in, answers out, on an injected clock. `modsoft.hil.polaris` documents
 the faults and puts it behind a serial port.
 
+It is a Vega, too, and an Aurora, which has no tool files: what is wired to it has a handle from the start.
 Resolution is the device's own: TX gives positions in 0.01 mm and quaternions in 1e-4, BX single floats. Frame numbers
-run at 60 Hz whatever the poses do. It is as strict as the device where a wrong order of calls would go unnoticed
-otherwise: only enabled tools are reported, and none before TSTART.
+run at the device's rate whatever the poses do. It is as strict as the device where a wrong order of calls would go
+unnoticed otherwise: only enabled tools are reported, and none before TSTART.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
-FRAME_HZ = 60.0
+from modsoft.runtime.ndi import FRAME_HZ
+
 FIRST_HANDLE = 0x0A  # as the wireless tools of the device: a handle is no index
 BX_START = 0xA5C4
 # Answer status, and error codes of the protocol.
@@ -84,9 +86,18 @@ class Refused(Exception):
 class Polaris:
     """The device without its line: commands in, answers out. `now` is a monotonic clock in seconds."""
 
-    def __init__(self, now: Callable[[], float] = time.monotonic, firmware: str = "Polaris Spectra Rev 009"):
-        """`firmware`: with "Rev 007" at its end the client asks for TX in place of BX."""
+    def __init__(
+        self,
+        now: Callable[[], float] = time.monotonic,
+        firmware: str = "Polaris Spectra Rev 009",
+        kind: str = "polaris",
+        wired: int = 0,
+    ):
+        """`firmware`: with "Rev 007" at its end the client asks for TX in place of BX. `kind`: as in the robot file;
+        `wired`: number of tools that need no definition file."""
         self.now = now
+        self._frame_hz = FRAME_HZ[kind]
+        self._wired = {FIRST_HANDLE + tool: "written" for tool in range(wired)}
         self.firmware = firmware
         self.faults: dict[str, Any] = {}
         self.commands: Counter[str] = Counter()
@@ -139,7 +150,7 @@ class Polaris:
     def _ascii(self, name: str, parameters: str) -> str:
         if name == "INIT":
             self._initialised, self.tracking = True, False
-            self._tools.clear()  # the client counts on that when it connects again
+            self._tools = dict(self._wired)  # the client counts on that when it connects again
             return "OKAY"
         if name == "GETINFO":
             return f"{parameters}=009.000;1;0;1;;;{parameters}"
@@ -226,7 +237,7 @@ class Polaris:
             poses = sample
             if sampled_s <= at_s:
                 break
-        return max(0, int((at_s - self._started_s) * FRAME_HZ) - self.faults.get("back", 0)), poses
+        return max(0, int((at_s - self._started_s) * self._frame_hz) - self.faults.get("back", 0)), poses
 
     def _tx(self, rows: list[tuple[int, Pose | None, int]]) -> str:
         text = f"{len(rows):02X}"

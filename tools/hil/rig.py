@@ -47,6 +47,7 @@ class Child:
         self._ready = threading.Event()
         self._ended = False
         self._stderr = tempfile.TemporaryFile()
+        self.ready: Line = {}
         self.summary: Line = {}
         self.process = subprocess.Popen(
             [sys.executable, "-P", "-m", module, *arguments],
@@ -94,6 +95,7 @@ class Child:
         for text in self._output:
             line = json.loads(text)
             if line["event"] == "ready":
+                self.ready = line
                 self._ready.set()
             elif line["event"] == "summary":
                 self.summary = line
@@ -130,7 +132,12 @@ class Rig:
             self._board_log = exits.enter_context((self.folder / "board.jsonl").open("w", encoding="utf-8"))
             self._plant_log = exits.enter_context((self.folder / "plant.jsonl").open("w", encoding="utf-8"))
             self.tool_files = write_tool_files(self._ports, self.robot.modules + 1)
-            self.tracker = Child("modsoft.hil.polaris", ["--link", self.tracker_port], lambda line: None)
+            kind = self.robot.tracker.type
+            fake = ["--link", str(self._ports / "ttyPolaris"), "--type", kind]
+            if kind == "aurora":  # its tools are wired
+                fake += ["--wired", str(len(self.tool_files))]
+                self.tool_files = []
+            self.tracker = Child("modsoft.hil.polaris", fake, lambda line: None)
             exits.callback(self.tracker.stop)
             self.tracker.wait_ready()
             self.plant = Child("modsoft.hil.plant", ["--robot", self._robot_file], self._plant_state)
@@ -154,7 +161,7 @@ class Rig:
 
     @property
     def tracker_port(self) -> str:
-        return str(self._ports / "ttyPolaris")
+        return str(self.tracker.ready["port"])
 
     def run(
         self, model: str | Path, task: str, *options: str, runs: Path | None = None
