@@ -46,6 +46,7 @@ import msgspec
 import numpy as np
 
 from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.runtime.files import decoded
 
 Line = dict[str, Any]
 
@@ -212,13 +213,13 @@ def read(folder: Path) -> Run:
     decode = msgspec.json.Decoder(Line).decode
     lines = []
     try:
-        meta = decode((folder / "meta.json").read_bytes())
-        for text in (folder / "run.jsonl").read_bytes().split(b"\n"):
+        meta = decode(decoded((folder / "meta.json").read_bytes()))
+        for text in decoded((folder / "run.jsonl").read_bytes()).split("\n"):
             try:
                 lines.append(decode(text))
             except msgspec.DecodeError:
                 continue
-    except (OSError, msgspec.DecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ModelError(f"{folder} is no folder of a run ({error})") from error
     told = [line["acknowledged"] for line in lines if line.get("acknowledged")]
     try:

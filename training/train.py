@@ -300,10 +300,14 @@ def _fit(
     state: dict[str, Any] = {"identity": identity, "iteration": 0, "elapsed_s": 0.0}
     state |= {"best": None, "best_percent": math.inf, "worse": 0}
     if resume.is_file():
-        state = _resumed(resume, identity)
-        network.load_state_dict(state["weights"])
-        optimiser.load_state_dict(state["optimiser"])
-        dropout_random.set_rng_state(state["random_state"])
+        state |= _resumed(resume, identity)
+        try:
+            network.load_state_dict(state["weights"])
+            optimiser.load_state_dict(state["optimiser"])
+            dropout_random.set_rng_state(state["random_state"])
+        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            why = " ".join(str(error).split())[:200]
+            raise ModelError(f"{resume}: not the state of this training ({why}); delete it to start again") from error
 
     per_epoch = -(-len(training) // settings.batch)
     iteration = first = state["iteration"]
@@ -385,7 +389,11 @@ def _finished(out: Path, identity: dict[str, Any]) -> dict[str, Any]:
 def _resumed(resume: Path, identity: dict[str, Any]) -> dict[str, Any]:
     state = checkpoints.read(resume)
     advice = "ask for the same to go on, or delete it to start anew"
-    _check_same(f"{resume}: of a run", state.get("identity", {}), identity, advice)
+    found = state.get("identity")
+    _check_same(f"{resume}: of a run", found if isinstance(found, dict) else {}, identity, advice)
+    numbers = (state.get(name, 0) for name in ("iteration", "elapsed_s", "best_percent", "worse"))
+    if not all(isinstance(number, int | float) and number >= 0 for number in numbers):
+        raise ModelError(f"{resume}: not the state of this training (its counts); delete it to start again")
     return state
 
 

@@ -95,7 +95,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path, order):
 
 def test_a_folder_that_cannot_be_made_is_told(tmp_path, order):
     (tmp_path / "out").symlink_to("/proc/none")
-    with pytest.raises(OutputError, match="out: cannot be written"):
+    with pytest.raises(OutputError, match="out: no such folder can be made"):
         order()
 
 

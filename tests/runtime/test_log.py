@@ -233,3 +233,30 @@ def test_reading_gives_each_tick_its_own_acknowledgement(tmp_path):
 def test_reading_what_is_no_run(tmp_path):
     with pytest.raises(ModelError, match="no folder of a run"):
         logs.read(tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_run_that_an_editor_of_windows_saved_is_read(tmp_path, encoding):
+    log = a_log(tmp_path)
+    log.put({"tick": 0, "acknowledged": None})
+    log.close(0, "done", {})
+    for name in ("meta.json", "run.jsonl"):
+        path = log.folder / name
+        path.write_bytes(path.read_text().replace("\n", "\r\n").encode(encoding))
+    assert [line["tick"] for line in logs.read(log.folder).ticks] == [0]
+
+
+@pytest.mark.parametrize("acknowledged", [{"ms": 1}, [1], 1, "x"])
+def test_reading_an_edited_run(tmp_path, acknowledged):
+    log = a_log(tmp_path)
+    log.put({"tick": 0, "acknowledged": acknowledged})
+    log.close(0, "done", {})
+    with pytest.raises(ModelError, match="not the log of a run"):
+        logs.read(log.folder)
+
+
+def test_a_folder_of_runs_may_be_a_link_to_one_that_is_not_there_yet(tmp_path):
+    (tmp_path / "runs").symlink_to(tmp_path / "disk" / "runs")
+    log = a_log(tmp_path / "runs")
+    log.close(0, "done", {})
+    assert (tmp_path / "disk" / "runs" / log.folder.name / "meta.json").is_file()

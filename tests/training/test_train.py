@@ -257,6 +257,22 @@ def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, iteration):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.pt", "straight.pt"]
 
 
+@pytest.mark.parametrize(
+    "changes", [{"identity": 1}, {"weights": {}}, {"weights": 1}, {"optimiser": {}}, {"worse": "x"}, {"iteration": -1}]
+)
+def test_a_state_that_is_none_of_this_training_is_one_line(tmp_path, changes):
+    out = tmp_path / "model.pt"
+    with pytest.raises(Cut):
+        train.train([make()], out, SMALL, cut_at(21))
+    resume = tmp_path / "model.pt.resume"
+    checkpoints.save({**checkpoints.read(resume), **changes}, resume)
+    before = resume.read_bytes()
+    with pytest.raises(ModelError, match=r"^[^\n]*model\.pt\.resume: [^\n]*delete it to start[^\n]*$"):
+        train.train([make()], out, SMALL)
+    assert resume.read_bytes() == before
+    assert not out.exists()
+
+
 def test_a_cut_run_of_other_settings_or_data_is_refused(tmp_path):
     out = tmp_path / "model.pt"
     with pytest.raises(Cut):

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from modsoft.runtime.errors import OutputError, UsageError
+from modsoft.runtime.files import make_folder
 from modsoft.runtime.locks import locked
 
 FINISHED = "report.json"  # written last: where it exists, the other files are complete
@@ -42,8 +43,8 @@ def claimed(folder: Path) -> Iterator[None]:
     """Checks, makes and marks `folder`, deletes what an interrupted run of the rig left in it, and keeps other runs of
     the rig out (`InUse`) for as long as the context lasts."""
     check(folder)
+    make_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         (folder / MARKER).write_text(MARKER_TEXT, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error.strerror}); choose another --report") from error

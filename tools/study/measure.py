@@ -14,38 +14,23 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime.configuration import angle_between_deg
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.files import decoded, written
+from modsoft.runtime.files import read_text, written
 from modsoft.study import flights, making, paper
 from modsoft.study.flights import Kept
 from modsoft.study.folder import Folder
 from modsoft.study.plan import Plan, Run
+from modsoft.study.results import KEYS, Results
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import coverage
 from modsoft.training.evaluate import configuration_errors_percent
 from modsoft.training.robots import CABLE
 
-KEYS = (
-    "table",  # 1, 2, 3, modules, robustness, end, coverage
-    "quantity",  # what mean and std are of, with its unit
-    "source",
-    "network",
-    "data",
-    "split",
-    "seed",
-    "task",
-    "modules",
-    "correction",
-    "disturbance",
-    "skip_first",  # steps at the start of the task that are left out
-    "module",  # 1 at the base
-    "mean",
-    "std",
-)
 ESTIMATION, CONTROL = "actuation estimation error, % of the range", "configuration error, % of the unit vector"
 TIP_DISTANCE, TIP_TILT = "distance of the tip from the axis, % of the robot's length", "tilt of the tip, degrees"
 COVERED = "space covered by the module's end, cm³"
@@ -69,15 +54,13 @@ def dumped(found: dict[str, Any]) -> str:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """results.json as it was written."""
+    """results.json as it was written; `ModelError` for any other file."""
+    if not path.is_file():
+        raise ModelError(f"no results {path}; modsoft-evaluate study --out {path.parent} makes them")
     try:
-        found = json.loads(decoded(path.read_bytes()))
-        wrong = {frozenset(record) ^ frozenset(KEYS) for record in found["records"]} - {frozenset()}
-        if wrong or "about" not in found:
-            raise ValueError(f"keys {sorted(set().union(*wrong))}")
-    except OSError as error:
-        raise ModelError(f"no results {path}; modsoft-evaluate study --out {path.parent} makes them") from error
-    except (ValueError, KeyError, TypeError) as error:
+        found = msgspec.json.decode(read_text(path))
+        msgspec.convert(found, Results)
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise ModelError(f"{path}: not the results of this version ({error}); measure again") from error
     return found
 
