@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modsoft.hil.polaris import write_tool_files
+from modsoft.hil.polaris import Line, write_tool_files
 from modsoft.hil.polaris_device import Polaris, crc16, quaternion
-from modsoft.runtime.errors import DeviceAbsent
+from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.ndi import NDI
 
 
@@ -201,6 +201,13 @@ def test_quaternion_gives_the_rotation_back(values):
     found = np.array(quaternion(pose.tolist()))
     assert found[0] >= 0
     assert abs(found @ [w, x, y, z]) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_file_in_the_place_of_the_port_stays(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(UsageError, match="file: exists and is no link"):
+        Line(tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_tool_files_are_told_apart(tmp_path):

@@ -175,7 +175,7 @@ def test_a_control_run_writes_nothing_below_the_home(model_file, tmp_path):
 def test_onnxruntime_is_imported_in_one_place():
     importers = [
         path.relative_to(ROOT).as_posix()
-        for folder in ("runtime", "training", "export", "tools")
+        for folder in ("runtime", "training", "export", "tools", "tests")
         for path in sorted((ROOT / folder).rglob("*.py"))
         if re.search(r"^\s*(import|from) onnxruntime", path.read_text(encoding="utf-8"), re.MULTILINE)
     ]

@@ -4,7 +4,6 @@ import os
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 from spoilt_models import onnx_description, sealed_at
@@ -15,6 +14,7 @@ from modsoft.hil import cli as hil_cli
 from modsoft.runtime import artefact
 from modsoft.runtime import cli as runtime_cli
 from modsoft.runtime.controller import Controller
+from modsoft.runtime.ort import onnxruntime
 
 
 def largest_weight(model):

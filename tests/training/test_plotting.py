@@ -1,8 +1,10 @@
 """Pictures are the same under any settings of the user's."""
 
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import matplotlib
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from modsoft.runtime.errors import OutputError
 from modsoft.training import plotting
 
+ROOT = Path(__file__).parents[2]
 CODE = """
 import sys
 from pathlib import Path
@@ -74,3 +77,17 @@ def test_a_picture_that_fails_is_one_line(tmp_path):
     with pytest.raises(OutputError, match=r"out\.png: not drawn \(.*nonsense"):
         plotting.save(draw, tmp_path / "out.png", 50)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_matplotlib_is_imported_in_one_place():
+    importers = [
+        path.relative_to(ROOT).as_posix()
+        for folder in ("runtime", "training", "export", "tools")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        if re.search(
+            r"^\s*(import|from) matplotlib",
+            re.sub(r"^if TYPE_CHECKING:\n(    .*\n)+", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE),
+            re.MULTILINE,
+        )
+    ]
+    assert importers == ["training/plotting.py"]
