@@ -15,6 +15,7 @@ from modsoft.runtime.artefact import Network
 from modsoft.runtime.configuration import feature_names
 from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.runtime.files import read_text
+from modsoft.runtime.robot import Robot
 from modsoft.training import checkpoint as checkpoints
 
 UNTOLD = (
@@ -59,6 +60,17 @@ def _meta(meta: Path) -> MetaFile:
         raise ModelError(f"{meta}: {error}; expected {UNTOLD}") from error
 
 
+def _robot(meta: Path, name: str) -> Robot:
+    """The robot file that a meta file names, which is beside it, or a shipped robot."""
+    path = meta.parent / name
+    if path.is_file():
+        return robots.load(path)
+    try:
+        return robots.shipped(name)
+    except RobotFileError as error:
+        raise RobotFileError(f"{meta}: no robot file {path}, and no shipped robot {name!r}") from error
+
+
 def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
     said = _meta(meta)
     content = checkpoints.read(path)
@@ -66,8 +78,7 @@ def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
         raise ModelError(f"{path}: a checkpoint that says all itself, expected a bare state dict; leave --meta out")
     weights = foreign.weights_of(content, said.weights, path)
     layers = sum(name.startswith("lstm.weight_hh_l") and not name.endswith("_reverse") for name in weights)
-    beside = meta.parent / said.robot
-    robot = robots.load(beside) if beside.exists() else robots.shipped(said.robot)
+    robot = _robot(meta, said.robot)
     return {
         "schema": checkpoints.SCHEMA,
         "robot": robot.to_dict(),

@@ -32,11 +32,7 @@ def locked(lock: Path, output: Path, command: str) -> Iterator[None]:
     file cannot be made. A link is not followed, since it might name any file of the user's.
     """
     while True:
-        try:
-            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-        except OSError as error:
-            why = "a link, expected a file" if lock.is_symlink() else error.strerror
-            raise OutputError(f"{lock}: cannot be made ({why}); delete it, or choose another --out") from error
+        descriptor = _open(lock)
         try:
             if not _take(descriptor):
                 raise InUse(f"{output}: another {command} works on it; wait for it, or stop it")
@@ -51,6 +47,18 @@ def locked(lock: Path, output: Path, command: str) -> Iterator[None]:
             os.close(descriptor)
             if os.name == "nt":  # an open file cannot be deleted there; one that another process opened stays
                 _delete(lock)
+
+
+def _open(lock: Path) -> int:
+    flags = getattr(os, "O_NOFOLLOW", 0)
+    try:
+        try:
+            return os.open(lock, os.O_RDWR | os.O_CREAT | flags, 0o666)
+        except PermissionError:  # left behind by another user
+            return os.open(lock, os.O_RDONLY | flags)
+    except OSError as error:
+        why = "a link, expected a file" if lock.is_symlink() else error.strerror
+        raise OutputError(f"{lock}: cannot be made ({why}); delete it, or choose another --out") from error
 
 
 def _take(descriptor: int) -> bool:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.runtime.files import decoded
+from modsoft.runtime.safety import REST_LIMIT_DEG
 
 ATTRIBUTES = {
     "schema": "a whole number",
@@ -101,7 +102,7 @@ def shapes(configuration: tuple[int, ...], action: tuple[int, ...], robot: robot
 
 
 def configuration(found: Array, where: Path) -> None:
-    """Finite unit vectors (E, K + 1, N, 3)."""
+    """Finite unit vectors (E, K + 1, N, 3), each episode from rest."""
     _finite("configuration", found, where)
     length = np.linalg.norm(found, axis=-1)
     wrong = np.argwhere(np.abs(length - 1.0) > LENGTH_TOLERANCE)
@@ -111,6 +112,15 @@ def configuration(found: Array, where: Path) -> None:
         raise ModelError(
             f"{where}: configuration of episode {episode}, step {step}, module {module + 1} is [{vector}], of length "
             f"{length[episode, step, module]:.4g}; expected a unit vector [v_x, v_y, v_z]"
+        )
+    bent_deg = np.degrees(np.arccos(np.clip(found[:, 0, :, 2], -1.0, 1.0)))
+    wrong = np.argwhere(bent_deg > REST_LIMIT_DEG)
+    if len(wrong):
+        episode, module = map(int, wrong[0])
+        raise ModelError(
+            f"{where}: episode {episode} begins with module {module + 1} bent by {bent_deg[episode, module]:.0f} "
+            f"degrees, expected it at rest (at most {REST_LIMIT_DEG:g}); is the order [v_x, v_y, v_z], v_z along the "
+            "robot?"
         )
 
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from modsoft.export.write import export
+from modsoft.runtime import robot as robots
 from modsoft.runtime.controller import Controller
-from modsoft.runtime.errors import ModelError
+from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.training import networks
 
 META = """
@@ -72,6 +73,20 @@ def test_half_precision_becomes_float32(tmp_path, weights, kind):
     torch.save({name: value.to(kind) for name, value in weights.items()}, tmp_path / "half.pt")
     (tmp_path / "meta.toml").write_bytes(codecs.BOM_UTF16_LE + META.encode("utf-16-le"))
     Controller.load(export(tmp_path / "half.pt", meta=tmp_path / "meta.toml").path)
+
+
+def test_the_robot_file_is_beside_the_meta_file(tmp_path, monkeypatch, weights):
+    lab, here = tmp_path / "lab", tmp_path / "here"
+    lab.mkdir()
+    here.mkdir()
+    monkeypatch.chdir(here)
+    torch.save(weights, "w.pt")
+    (here / "own.toml").write_text(robots.text_of("cable-4"))
+    (lab / "meta.toml").write_text(META.replace("pneumatic-3", "own.toml"))
+    with pytest.raises(RobotFileError, match=r"meta\.toml: no robot file .*lab/own\.toml, and no shipped robot"):
+        export("w.pt", meta=lab / "meta.toml")
+    (lab / "own.toml").write_text(robots.text_of("pneumatic-2"))
+    assert export("w.pt", meta=lab / "meta.toml").description.modules_trained_on == [2]
 
 
 def test_of_several_state_dicts_one_is_chosen(tmp_path, weights, plain):

@@ -70,6 +70,23 @@ def test_a_file_of_somebody_else_keeps_its_content(tmp_path):
     assert (tmp_path / "out.lock").read_text() == "mine"
 
 
+def test_a_file_that_another_user_left_blocks_nothing(tmp_path, monkeypatch):
+    """Root may write to any file, so the system's refusal is played."""
+    (tmp_path / "out.lock").touch()
+    opened = os.open
+
+    def refusing(path, flags, *mode):
+        if flags & os.O_RDWR:
+            raise PermissionError(13, "Permission denied")
+        return opened(path, flags, *mode)
+
+    monkeypatch.setattr(os, "open", refusing)
+    with held(tmp_path / "out.lock"):
+        with pytest.raises(InUse), held(tmp_path / "out.lock"):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("kind", ["link", "folder", "no folder"])
 def test_what_cannot_be_a_lock_is_one_line(tmp_path, kind):
     lock, private = tmp_path / "out.lock", tmp_path / "private"

@@ -73,6 +73,7 @@ WRONG = {
         {"configuration": put(CONFIGURATION, (1, 4, 2), 0.0)},
         r"episode 1, step 4, module 3 is \[0, 0, 0\]",
     ),
+    "other order": ({"configuration": CONFIGURATION[..., [2, 0, 1]]}, "episode 0 begins with module 1 bent by 90"),
     "NaN": (
         {"configuration": put(CONFIGURATION, (1, 4, 2, 0), np.nan)},
         "not finite, first in episode 1, step 4, module 3",
