@@ -22,10 +22,8 @@ install:
 $(INSTALLED): pyproject.toml setup.py constraints.txt tools/install.sh training/fleet.c training/fleet_kernel.h $(MOVED)
 	tools/install.sh
 
-# Tests judged against the wall clock run alone, after all others.
 test: $(INSTALLED)
-	$(PYTEST) -n 2 --dist worksteal -m "not realtime and not cluster"
-	$(PYTEST) -m realtime
+	tools/test.sh
 
 # Collection through a real one-node SLURM, which the test installs and starts: root on Debian.
 test-cluster: $(INSTALLED)

@@ -8,10 +8,9 @@ import os
 import sys
 from pathlib import Path
 
+import host_load
 import pytest
 from hypothesis import settings
-
-sys.path.insert(0, str(Path(__file__).parent / "shared"))
 
 # A busy machine is no defect: what is judged against the wall clock says so with a marker.
 settings.register_profile("modsoft", deadline=None)
@@ -25,6 +24,28 @@ def pytest_configure():
     installed, here = Path(spec.origin).resolve().parents[1], Path(__file__).resolve().parents[1]
     if installed != here and (installed / "pyproject.toml").is_file():
         raise pytest.UsageError(f"{sys.executable} has modsoft from {installed}, not from {here}: make install")
+
+
+@pytest.fixture(scope="session")
+def _host_load():
+    load = host_load.HostLoad()
+    yield load
+    load.close()
+
+
+@pytest.fixture(autouse=True)
+def _measured_host(request):
+    """Tests against the wall clock run beside the host-load check; `pytest_runtest_makereport` reads its result."""
+    if request.node.get_closest_marker("realtime"):
+        request.node.host_load = request.getfixturevalue("_host_load")
+        request.node.host_load.worst_s()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    report = yield
+    load = getattr(item, "host_load", None)
+    return host_load.judged(report, load.worst_s()) if load and call.when == "call" else report
 
 
 @pytest.fixture(autouse=True)

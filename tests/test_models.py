@@ -12,6 +12,8 @@ from modsoft.training import evaluate, kernel
 from modsoft.training.evaluate import Pilot
 from modsoft.training.fleet import Fleet
 
+pytestmark = pytest.mark.instructions
+
 MODELS = Path(__file__).parents[1] / "tools/models"
 needs_fleet = pytest.mark.skipif(not kernel.variants(), reason="the fleet's kernel is not built here")
 

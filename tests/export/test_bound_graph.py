@@ -15,6 +15,8 @@ from modsoft.runtime.controller import Controller
 from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
 
+pytestmark = pytest.mark.instructions
+
 BOUND = ("lstm", "module-lstm")
 N, F = 4, 16  # cable-4 with three time steps
 

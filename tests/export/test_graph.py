@@ -11,6 +11,8 @@ from modsoft.runtime.artefact import ACTUATION, FEATURES, FROM_NEIGHBOURS, TO_NE
 from modsoft.runtime.controller import unit_of
 from modsoft.training.networks import BiLSTM
 
+pytestmark = pytest.mark.instructions
+
 F, A = 7, 2
 
 

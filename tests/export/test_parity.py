@@ -12,6 +12,8 @@ from modsoft.runtime.controller import unit_of
 from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
 
+pytestmark = pytest.mark.instructions
+
 
 def change(model, name, function):
     """Replaces the initializer `name` by function(array)."""

@@ -21,6 +21,8 @@ label = "base -1, tip +1"
 features = "states and actions by time step, then label"
 [provenance]
 from = "elsewhere"
+
+pytestmark = pytest.mark.instructions
 """
 
 

@@ -11,6 +11,8 @@ from modsoft.training import checkpoint, evaluate
 from modsoft.training.evaluate import Pilot
 from modsoft.training.networks import BiLSTM
 
+pytestmark = pytest.mark.instructions
+
 FULL_DEG = 100.0
 
 

@@ -12,6 +12,8 @@ from modsoft.training.arm import Arm
 from modsoft.training.fleet import Arms, Fleet
 from modsoft.training.robots import PLANTS
 
+pytestmark = pytest.mark.instructions
+
 BENCHMARK = Path(__file__).parents[2] / "tools" / "bench" / "simulation.py"
 REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
 ACTIONS = {"cable": 2, "pneumatic": 1}

@@ -7,6 +7,8 @@ from scipy.optimize import linprog
 
 from modsoft.training import muon, networks
 
+pytestmark = pytest.mark.instructions
+
 
 def matrix(rows, columns, smallest=0.02, seed=0):
     """A random matrix with singular values between `smallest` and 1 of the scale that orthogonalized assumes."""

@@ -8,6 +8,8 @@ from modsoft.runtime.configuration import feature_names, features
 from modsoft.runtime.errors import ModelError
 from modsoft.training import networks
 
+pytestmark = pytest.mark.instructions
+
 N, T, S, A = 4, 5, 3, 2  # the cable robot of four modules
 
 

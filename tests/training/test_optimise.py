@@ -9,7 +9,10 @@ from modsoft.training import kernel, optimise
 from modsoft.training.fleet import Fleet
 from modsoft.training.optimise import Floor, floor, greedy, improved
 
-pytestmark = pytest.mark.skipif(kernel.library() is None, reason="the kernel is not built here (no C compiler)")
+pytestmark = [
+    pytest.mark.instructions,
+    pytest.mark.skipif(kernel.library() is None, reason="the kernel is not built here (no C compiler)"),
+]
 
 
 def motion(modules=2, steps=8, seed=0):

@@ -16,6 +16,8 @@ from modsoft.training import arm, collect, dataset, kernel, plants
 from modsoft.training.actions import draw_actions
 from modsoft.training.fleet import Fleet
 
+pytestmark = pytest.mark.instructions
+
 needs_fleet = pytest.mark.skipif(not kernel.variants(), reason="the fleet's kernel is not built here")
 
 

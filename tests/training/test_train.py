@@ -13,6 +13,8 @@ from modsoft.runtime.errors import InUse, ModelError, TargetNotReached, UsageErr
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training import dataset, train
 
+pytestmark = pytest.mark.instructions
+
 SMALL = train.Settings(history=3, iterations=60, batch=32, layers=2, hidden=8)
 
 

@@ -1,0 +1,58 @@
+"""The host-load check: whether the machine itself stalled while a test was judged against the wall clock.
+
+A process of its own sleeps for 5 ms at a time and keeps by how much it woke up late. A machine that starves it for
+longer than LIMIT_S starves the runtime and the rig too: a control tick is then late by no fault of theirs.
+"""
+
+import subprocess
+import sys
+
+import pytest
+
+LIMIT_S = 0.1  # as the rig's own (modsoft.hil.judge): the shortest time-out of the board is 0.3 s
+_SLEEPER = """
+import select, sys, time
+worst = 0.0
+last = time.monotonic()
+while True:
+    asked, _, _ = select.select([sys.stdin], [], [], 0.005)
+    now = time.monotonic()
+    worst, last = max(worst, now - last - 0.005), now
+    if asked:
+        if not sys.stdin.readline():
+            break
+        print(worst, flush=True)
+        worst = 0.0
+"""
+
+
+class HostLoad:
+    """Measures from its start; `worst_s` gives the longest stall since the call before."""
+
+    def __init__(self) -> None:
+        self._sleeper = subprocess.Popen(
+            [sys.executable, "-c", _SLEEPER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def worst_s(self) -> float:
+        assert self._sleeper.stdin is not None
+        assert self._sleeper.stdout is not None
+        self._sleeper.stdin.write("\n")
+        self._sleeper.stdin.flush()
+        return float(self._sleeper.stdout.readline())
+
+    def close(self) -> None:
+        assert self._sleeper.stdin is not None
+        self._sleeper.stdin.close()
+        self._sleeper.wait()
+
+
+def judged(report: pytest.TestReport, worst_s: float) -> pytest.TestReport:
+    """The report of a test against the wall clock: a failure while the host stalled is no verdict, and is shown as a
+    skipped test with the reason."""
+    if report.failed and worst_s > LIMIT_S:
+        reason = f"not judged: host-load check, this machine stalled for {worst_s * 1e3:.0f} ms during the test"
+        report.sections.append(("failure that is not judged", str(report.longrepr)))
+        report.outcome = "skipped"
+        report.longrepr = (report.nodeid, report.location[1] or 0, f"Skipped: {reason}")
+    return report
