@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from modsoft.runtime.robot import KINDS
 
 COMPONENTS = ("v_x", "v_y", "v_z")
+REST_LIMIT_DEG = 60.0  # a module that is bent further does not hang at rest
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.configuration import angle_between_deg, from_poses
+from modsoft.runtime.configuration import REST_LIMIT_DEG, angle_between_deg, from_poses
 from modsoft.runtime.errors import LostInRun, ModelError, ModsoftError, Tripped
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.tracker import Frame
@@ -23,7 +23,6 @@ STRETCH = 1.3  # a module's end is never further from the end before it than at 
 STRETCH_MM = 10.0
 BEHIND = 0.25  # of its distance at rest: no bent module's end gets so far behind the end before it
 SIZE_TOLERANCE = 0.02  # of the length of a rotation's third axis
-REST_LIMIT_DEG = 60.0
 
 # Why a frame is not used. With the first group the tracker is as good as gone.
 NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED = "no frame", "stale", "frozen", "backwards", "delayed"

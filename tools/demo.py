@@ -64,7 +64,7 @@ STAGES = [
         DATA,
         [f"runtime/robots/{ROBOT}.toml", "training/fleet*.[ch]", *SHARED]
         + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "collect")]
-        + [f"training/{name}.py" for name in ("actions", "dataset", "hdf5", "shards", "backends")],
+        + [f"training/{name}.py" for name in ("actions", "dataset", "dataset_checks", "hdf5", "shards", "backends")],
     ),
     Stage(
         "train the biLSTM controller",
@@ -73,7 +73,8 @@ STAGES = [
          "--minutes", "5"],
         CHECKPOINT,
         [str(DATA), *SHARED]
-        + [f"training/{name}.py" for name in ("train", "muon", "dataset", "hdf5", "networks", "checkpoint")],
+        + [f"training/{name}.py" for name in ("train", "muon", "networks", "checkpoint")]
+        + [f"training/{name}.py" for name in ("dataset", "dataset_checks", "hdf5")],
     ),
     Stage(
         "export it and compare it with torch",

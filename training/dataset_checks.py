@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.configuration import REST_LIMIT_DEG
 from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.runtime.files import decoded
-from modsoft.runtime.safety import REST_LIMIT_DEG
 
 ATTRIBUTES = {
     "schema": "a whole number",
