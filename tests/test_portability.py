@@ -71,6 +71,20 @@ def test_collecting_training_and_exporting_run_to_their_end(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data.h5", "model.onnx", "model.pt"]
 
 
+def test_tests_of_the_portable_parts_can_be_collected():
+    code = (
+        "import runpy, serial, sys\n"  # pyserial itself needs fcntl on this system
+        f"runpy.run_path({str(HIDDEN / 'sitecustomize.py')!r})\n"
+        "import pytest\n"
+        "sys.exit(pytest.main(['-q', '--collect-only', '-p', 'no:cacheprovider', *sys.argv[1:]]))"
+    )
+    arguments = ("tests/runtime", "tests/training", "tests/export")
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stdout[-3000:]
+
+
 def hanging_still(path, tools):
     """Writes a run's log with six seconds of frames in which the tools hang straight under each other."""
     noise = random.Random(1)

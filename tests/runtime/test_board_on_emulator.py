@@ -11,10 +11,12 @@ import time
 import numpy as np
 import pytest
 
-from modsoft.hil.emulator import EmulatedBoard, choose, is_event, missing_packages
 from modsoft.runtime import robot
 from modsoft.runtime.board import Board
 from modsoft.runtime.protocol import ResetCause, VentMode
+
+pytest.importorskip("fcntl", reason="the rig needs Linux")
+from modsoft.hil.emulator import EmulatedBoard, choose, is_event, missing_packages  # noqa: E402
 
 pytestmark = pytest.mark.realtime
 

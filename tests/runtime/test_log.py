@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -209,7 +208,7 @@ def test_a_killed_process_has_lost_nothing(tmp_path):
         assert process.stdout.readline() == b"put\n"
         [path] = tmp_path.glob("*/run.jsonl")
         wait_for(lambda: path.read_bytes().endswith(b'{"tick":99}\n'))
-        process.send_signal(signal.SIGKILL)
+        process.kill()
     assert [json.loads(line)["tick"] for line in path.read_text().splitlines()] == list(range(100))
     assert json.loads((path.parent / "meta.json").read_text())["exit_code"] is None
 

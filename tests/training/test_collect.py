@@ -1,7 +1,6 @@
 """Collection that survives being killed."""
 
 import json
-import signal
 import subprocess
 import sys
 import textwrap
@@ -257,7 +256,7 @@ def test_killed_and_started_again_gives_the_same_file_bit_for_bit(tmp_path, jobs
     assert victim.stdout is not None
     for _ in range(4):
         assert victim.stdout.readline() == "begun 2\n"
-    victim.send_signal(signal.SIGKILL)
+    victim.kill()
     victim.wait()
     assert victim.stdout.read().count("done") == 0  # ends once the workers are gone too: none is left behind
     assert not (killed / "d.h5").exists()

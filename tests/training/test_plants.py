@@ -1,7 +1,6 @@
 """The simulated robots behind collection: they agree, and a killed collection of the real robot goes on."""
 
 import importlib.util
-import signal
 import subprocess
 import sys
 import time
@@ -141,7 +140,7 @@ def test_a_killed_collection_of_the_real_robot_gives_the_same_file(tmp_path):
     while not any(parts.glob("episode-*.npz")):
         assert victim.poll() is None
         assert time.monotonic() < patience
-    victim.send_signal(signal.SIGKILL)
+    victim.kill()
     victim.wait()
     assert not (tmp_path / "killed.h5").exists()
     again = subprocess.run(

@@ -1,7 +1,6 @@
 """modsoft-train as a command, killed for real."""
 
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -52,7 +51,7 @@ def test_killed_and_started_again_it_ends_with_the_same_model(folder):
     while not resume.exists():
         assert victim.poll() is None
         assert time.monotonic() < patience
-    victim.send_signal(signal.SIGKILL)
+    victim.kill()
     victim.wait()
     assert not (folder / "m.pt").exists()
     again = run(folder, "d.h5", "--out", "m.pt", *QUICK)
