@@ -11,7 +11,7 @@ PYTEST := .venv/bin/python -m pytest
 INSTALLED := .venv/.installed
 MOVED := $(shell [ ! -e $(INSTALLED) ] || [ "$$(cat $(INSTALLED))" = "$$(pwd -P)" ] || echo moved)
 
-.PHONY: demo install test test-cluster reliability soak check coverage mutation fuzz firmware clean moved
+.PHONY: demo install test test-python test-cluster reliability soak check coverage mutation fuzz firmware clean moved
 
 demo: $(INSTALLED)
 	.venv/bin/python tools/demo.py
@@ -24,6 +24,10 @@ $(INSTALLED): pyproject.toml setup.py constraints.txt tools/install.sh training/
 
 test: $(INSTALLED)
 	tools/test.sh
+
+# The tests of runtime and export on every Python from 3.11 to 3.13 that is found.
+test-python: $(INSTALLED)
+	tools/test_pythons.sh
 
 # Collection through a real one-node SLURM, which the test installs and starts: root on Debian.
 test-cluster: $(INSTALLED)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import os
 from collections.abc import Iterator
@@ -52,6 +53,8 @@ def locked(lock: Path, output: Path, command: str) -> Iterator[None]:
 def _open(lock: Path) -> int:
     flags = getattr(os, "O_NOFOLLOW", 0)
     try:
+        if lock.is_symlink():  # Windows has no O_NOFOLLOW
+            raise OSError(errno.ELOOP, "a link, expected a file")
         try:
             return os.open(lock, os.O_RDWR | os.O_CREAT | flags, 0o666)
         except PermissionError:  # left behind by another user

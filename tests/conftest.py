@@ -64,7 +64,7 @@ def make_checkpoint():
     """make_checkpoint(path, robot="pneumatic-3", ...) writes a random checkpoint; gain scales its weights up."""
 
     def make(path, robot="pneumatic-3", history=3, layers=2, hidden=8, gain=1.0, seed=0, name="bilstm"):
-        import torch
+        torch = pytest.importorskip("torch")
 
         from modsoft.runtime import robot as robots
         from modsoft.runtime.configuration import feature_names
@@ -97,16 +97,30 @@ def make_checkpoint():
 
 
 @pytest.fixture(scope="session")
-def model_file(tmp_path_factory, make_checkpoint):
-    """A small model.onnx for pneumatic robots, history 3, exported and checked as any other. Not to be changed."""
-    from modsoft.export.write import export
+def exported(tmp_path_factory, make_checkpoint):
+    """exported(name, **how) gives the model of make_checkpoint(**how). Models of the folder MODSOFT_TEST_MODELS are
+    taken from there, and made there where they are missing: a Python without torch tests with those of another."""
+    folder = os.environ.get("MODSOFT_TEST_MODELS")
 
-    return export(make_checkpoint(tmp_path_factory.mktemp("model") / "model.pt")).path
+    def export_once(name, **how):
+        path = Path(folder, f"{name}.onnx") if folder else tmp_path_factory.mktemp(name) / f"{name}.onnx"
+        if not path.exists():
+            checkpoint = make_checkpoint(path.with_suffix(".pt"), **how)
+            from modsoft.export.write import export
+
+            export(checkpoint, path)
+        return path
+
+    return export_once
 
 
 @pytest.fixture(scope="session")
-def strong_model(tmp_path_factory, make_checkpoint):
-    """A model whose answers reach the end of the range: module 1 at full pressure. Not to be changed."""
-    from modsoft.export.write import export
+def model_file(exported):
+    """A small model.onnx for pneumatic robots, history 3, exported and checked as any other. Not to be changed."""
+    return exported("model")
 
-    return export(make_checkpoint(tmp_path_factory.mktemp("strong") / "model.pt", gain=4.0)).path
+
+@pytest.fixture(scope="session")
+def strong_model(exported):
+    """A model whose answers reach the end of the range: module 1 at full pressure. Not to be changed."""
+    return exported("strong", gain=4.0)

@@ -16,7 +16,7 @@ from modsoft.runtime.board import Board
 from modsoft.runtime.protocol import ResetCause, VentMode
 
 pytest.importorskip("fcntl", reason="the rig needs Linux")
-from modsoft.hil.emulator import EmulatedBoard, choose, is_event, missing_packages  # noqa: E402
+from modsoft.hil.emulator import EmulatedBoard, choose, is_event, missing_packages
 
 pytestmark = pytest.mark.realtime
 
