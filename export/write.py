@@ -37,11 +37,13 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
     that stood at `out` before stands there still.
     """
     model = Path(model)
-    out = model.with_suffix(".onnx") if out is None else Path(out)
+    out, is_default = (model.with_suffix(".onnx"), True) if out is None else (Path(out), False)
     check_writable(out)
     if model.suffix == ".onnx":
         raise UsageError(f"{model}: is ONNX already; did you mean modsoft-export --inspect {model}?")
     check_not_input(out, model, *([] if meta is None else source.files_of(Path(meta))))
+    if is_default and out.exists() and out != model:
+        _check_own(out)
     checkpoint = source.read(model, None if meta is None else Path(meta))
     network, sizes = checkpoints.network_of(checkpoint), source.network_of(checkpoint)
     expected = parity.reference(network, sizes)
@@ -61,6 +63,14 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
         except ModelError as error:
             raise ModelError(f"{out} not written: {str(error).replace(str(temporary), out.name)}") from error
     return Exported(out, described, report)
+
+
+def _check_own(out: Path) -> None:
+    """`UsageError` where a file that the user did not name as output is no model of modsoft-export."""
+    try:
+        artefact.read(out)
+    except ModelError as error:
+        raise UsageError(f"{out}: exists, and is no model of modsoft-export; give --out {out}, or delete it") from error
 
 
 def describe(checkpoint: dict[str, Any], sizes: Network, weights: Weights, expected: parity.Reference) -> Description:

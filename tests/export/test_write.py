@@ -21,9 +21,9 @@ label = "base -1, tip +1"
 features = "states and actions by time step, then label"
 [provenance]
 from = "elsewhere"
+"""
 
 pytestmark = pytest.mark.instructions
-"""
 
 
 @pytest.fixture
@@ -151,6 +151,17 @@ def test_out_must_be_a_file_in_a_folder(model, tmp_path):
             export(model, out)
     with pytest.raises(UsageError, match="another name"):
         export(model, model)
+
+
+@pytest.mark.parametrize("content", [b"mine", b""])
+def test_a_file_that_export_did_not_make_is_replaced_only_where_it_is_named(model, content):
+    out = model.with_suffix(".onnx")
+    out.write_bytes(content)
+    with pytest.raises(UsageError, match=r"model\.onnx: exists, and is no model of modsoft-export; give --out"):
+        export(model)
+    assert out.read_bytes() == content
+    assert export(model, out).path == out
+    assert export(model).path == out, "its own is replaced"
 
 
 @pytest.fixture
