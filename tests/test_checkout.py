@@ -60,10 +60,11 @@ def test_a_moved_environment_refers_to_its_new_place(tmp_path):
 
 
 def test_tests_of_another_checkout_than_the_installed_one_do_not_run(tmp_path):
-    (tmp_path / "tests").mkdir()
-    shutil.copy(ROOT / "tests" / "conftest.py", tmp_path / "tests")
+    shutil.copytree(ROOT / "tests" / "shared", tmp_path / "tests" / "shared")
+    for name in ("pyproject.toml", "tests/conftest.py"):
+        shutil.copy(ROOT / name, tmp_path / name)
     (tmp_path / "tests" / "test_it.py").write_text("def test_it():\n    pass\n")
-    done = run(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests", cwd=tmp_path)
+    done = run(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_it.py", cwd=tmp_path)
     assert done.returncode == pytest.ExitCode.USAGE_ERROR
     assert f"has modsoft from {ROOT}, not from {tmp_path}: make install" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
