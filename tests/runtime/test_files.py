@@ -88,6 +88,7 @@ def test_a_link_stays_and_its_target_is_written_beside_the_target(tmp_path, disk
     assert os.listdir(disk) == ["data.bin"]
 
 
+@pytest.mark.skipif(os.name != "posix", reason="device files of POSIX")
 def test_a_link_that_cannot_be_written_through_is_one_line(tmp_path, disk, monkeypatch):
     home = tmp_path / "home"
     (home / "loop").symlink_to("loop")
