@@ -10,29 +10,26 @@
 
 enum { MOST_ACTUATORS = 4 };
 
-/* One kind of robot, SI units; what makes its elements unlike stands in the three arrays. fleet.py fills it in, field by
- * field. */
+/* One kind of robot; what makes its elements unlike stands in the three arrays. fleet.py fills it in, field by field.
+ * Units: the rest length of an element, the time step, and newton; so a velocity is in rest lengths a time step. */
 struct plant {
     int64_t actuators;            /* that act on a module at a time */
     int64_t axis[MOST_ACTUATORS]; /* 0 or 1: the director that each of them stands along */
     int64_t lags;                 /* whether the actuators follow their goal late */
-    double time_step;
-    double rest_length;         /* of an element */
-    double inverse_rest_length; /* of an element */
-    double volume_over_pi;      /* of an element */
-    double shear, stretch;      /* stiffness of a section, N */
-    double bend[3];             /* N m^2 at rigidity 1, the last is twist */
-    double half_damping;        /* N s/m^2: each of an element's two nodes takes half */
-    double drag[3];             /* on (radius * length) |u| u, half of it likewise */
+    double tiny;                /* added to the length of an element, as PyElastica does */
+    double shear, stretch;      /* stiffness of a section */
+    double bend[2];             /* and twist: couple of half a curvature, at rigidity 1 */
+    double half_damping;        /* negative; on the sum of an element's two node velocities; each node takes half */
+    double drag[2];             /* across and along; on that sum squared, half of it likewise */
     double weight[4];           /* of an actuator's stress, powers of its stretch */
     double longest;             /* stretch beyond which an actuator is slack */
     double valve_share, chamber_share; /* of the way to go, a time step */
-    double friction, friction_curvature; /* of the wall, N m^2, and where it slips, 1/m */
-    double gravity_kick;        /* m/s a time step */
-    double gyration[3];         /* time step of the rotational kick, s, of each axis */
-    double turn_kick[3];        /* rad/s for a torque of 1 N m */
-    double fade_kick[3];        /* damping of the rotation, of a length of 1 m */
-    const double *mobility;     /* (elements + 1): time step over the mass of a node, s/kg */
+    double friction, friction_curvature; /* of the wall: couple of half a curvature, and the half where it slips */
+    double gravity_kick;        /* velocity of a time step */
+    double gyration[2];         /* time steps of the rotational kick, of axes 0 and 1 and of axis 2 */
+    double turn_kick[2];        /* angular velocity of a unit torque, likewise */
+    double fade_kick[2];        /* damping of the rotation at rest length, likewise */
+    const double *mobility;     /* (elements + 1): velocity that a unit force gives a node in a time step */
     const double *stiffness;    /* (elements): of shear and stretch, over that of the kind */
     const double *rigidity;     /* (elements - 1): of bend and twist in a Voronoi domain, likewise */
 };

@@ -87,14 +87,16 @@ class Fleet:
         self.plant = PLANTS[kind].carrying(tip_payload_kg)
         self.time_step_s = self.plant.time_step_s if time_step_s is None else time_step_s
         self._alternate = kernel.alternate(self.plant)
-        self._places = np.array(kernel.places(self.plant)[1])
         elements = modules * self.plant.elements
         area = math.pi * self.plant.radius_m**2
         mass = np.full(elements + 1, self.plant.density_kg_m3 * area * self.plant.module_length_m / self.plant.elements)
         mass[[0, -1]] *= 0.5
         mass[self.plant.elements :: self.plant.elements] += self.plant.connector_mass_kg
         mass[-1] += self.plant.tip_mass_kg - self.plant.connector_mass_kg
-        self._mobility = self.time_step_s / mass
+        # The kernel's units: the rest length of an element, the time step, newton.
+        self._rest_length_m = self.plant.module_length_m / self.plant.elements
+        self._places = 0.5 * self.plant.radius_m / self._rest_length_m * np.array(kernel.places(self.plant)[1])
+        self._mobility = self.time_step_s**2 / self._rest_length_m / mass
         self._stiffness = self.plant.stiffness_ratios(modules, stiffness)
         self._rigidity = self.plant.bend_ratios(self._stiffness)
         self._constants = self._with_arrays(damping)
@@ -117,14 +119,14 @@ class Fleet:
         """Module ends (B, N, 3), m."""
         every = self.plant.elements
         ends = np.moveaxis(self._state[:, every::every, _POSITION], -1, 1)
-        return ends.reshape(-1, self.modules, 3)[: self.count].copy()  # of one block it would be a view
+        return ends.reshape(-1, self.modules, 3)[: self.count] * self._rest_length_m
 
     @property
     def directors(self) -> Array:
         """Frames of each module's last element (B, N, 3, 3), rows d1, d2, d3 in the lab frame."""
         every = self.plant.elements
         ends = np.moveaxis(self._state[:, every - 1 : -1 : every, _DIRECTOR], -1, 1)
-        return ends.reshape(-1, self.modules, 3, 3)[: self.count].copy()
+        return ends.reshape(-1, self.modules, 3, 3)[: self.count].copy()  # of one block it would be a view
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -210,7 +212,7 @@ class Fleet:
         elements = self.modules * self.plant.elements
         state = _aligned((1, elements + 1, _ELEMENT, self.lanes))
         drive = _aligned((1, self.modules, len(self._places), 4, self.lanes))
-        state[0, :, 2] = np.linspace(0.0, self.modules * self.plant.module_length_m, elements + 1)[:, None]
+        state[0, :, 2] = np.arange(elements + 1.0)[:, None]
         state[0, :, _DIRECTOR] = np.eye(3).reshape(9, 1)
         self._set(drive, np.zeros((self.lanes, self.modules, len(self.plant.actuators.angles_deg) // 2)))
         if self._constants.lags:

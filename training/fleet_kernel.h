@@ -28,7 +28,7 @@ struct NAME(drive) {
 
 struct NAME(work) {
     V length, inverse, radius, strain[3], stress[3], drag[3], rate; /* A; strain is sigma + e3 */
-    V kappa[3], couple[3], curl[3], slope;                          /* B, with the element before; half radius * kappa */
+    V kappa[3], couple[3], curl[3], slope;                          /* B, with the element before; kappa is halved */
     V pair[3], force[3], front[3], back[3], moment[3], turn[3];     /* C; forces on the node before and the one after */
 };
 
@@ -49,11 +49,10 @@ INLINE V NAME(root)(V x)
 #endif
 }
 
-/* Q <- exp(h omega) Q: sin(x)/x and (1 - cos x)/x^2 as series in x^2 = t; relative error below t^4 / 362880, which is
- * 1e-17 up to 0.04 rad a time step. */
-INLINE void NAME(rotate)(V *restrict q, const V *restrict omega, double h)
+/* Q <- exp(w) Q: sin(x)/x and (1 - cos x)/x^2 as series in x^2 = t; relative error below t^4 / 362880, which is 1e-17 up
+ * to 0.04 rad a time step. */
+INLINE void NAME(rotate)(V *restrict q, const V *restrict w)
 {
-    V w[3] = {h * omega[0], h * omega[1], h * omega[2]};
     V t = DOT(w, w);
     V s = 1.0 + t * (-1.0 / 6 + t * (1.0 / 120 + t * (-1.0 / 5040)));
     V c = 0.5 + t * (-1.0 / 24 + t * (1.0 / 720 + t * (-1.0 / 40320)));
@@ -69,33 +68,36 @@ INLINE void NAME(rotate)(V *restrict q, const V *restrict omega, double h)
     }
 }
 
-/* A: drift of the element and of the node after it by h seconds; length, strain, stress, damping and drag. */
-INLINE void NAME(geometry)(const struct plant *p, double stiffness, ELEMENT *e, WORK *o, double h)
+/* A: drift of the element and of the node after it by a time step; length, strain, stress, damping and drag. */
+INLINE void NAME(geometry)(const struct plant *p, double stiffness, ELEMENT *e, WORK *o)
 {
     V d[3], dv[3], v[3], u[3];
     for (int i = 0; i < 3; i++) {
-        e[1].position[i] += h * e[1].velocity[i];
+        e[1].position[i] += e[1].velocity[i];
         d[i] = e[1].position[i] - e[0].position[i];
         dv[i] = e[1].velocity[i] - e[0].velocity[i];
-        v[i] = 0.5 * (e[1].velocity[i] + e[0].velocity[i]);
+        v[i] = e[1].velocity[i] + e[0].velocity[i];
     }
-    NAME(rotate)(e->director, e->omega, h);
-    V length = NAME(root)(DOT(d, d)) + 1e-14; /* as PyElastica has it */
+    NAME(rotate)(e->director, e->omega);
+    V length = NAME(root)(DOT(d, d)) + p->tiny;
     V inverse = 1.0 / length;
-    V radius = NAME(root)(p->volume_over_pi * inverse);
-    V firm = stiffness * (p->rest_length * inverse);
+    V radius = NAME(root)(inverse);
     for (int i = 0; i < 3; i++) {
         const V *row = e->director + 3 * i;
-        o->strain[i] = DOT(row, d) * p->inverse_rest_length;
+        o->strain[i] = DOT(row, d);
         u[i] = DOT(row, v);
     }
-    o->stress[0] = p->shear * o->strain[0] * firm;
-    o->stress[1] = p->shear * o->strain[1] * firm;
-    o->stress[2] = p->stretch * (o->strain[2] - 1.0) * firm;
+    V firm = stiffness * inverse;
+    V shear = p->shear * firm;
+    o->stress[0] = shear * o->strain[0];
+    o->stress[1] = shear * o->strain[1];
+    o->stress[2] = p->stretch * firm * (o->strain[2] - 1.0);
+    V damping = p->half_damping * length;
     V section = radius * length;
+    V across = p->drag[0] * section, along = p->drag[1] * section;
     for (int i = 0; i < 3; i++) {
         V speed = (V)((M)u[i] & INT64_MAX);
-        o->drag[i] = -(p->half_damping * length + p->drag[i] * section * speed) * u[i];
+        o->drag[i] = (damping - (i < 2 ? across : along) * speed) * u[i];
     }
     o->rate = DOT(d, dv) * (inverse * inverse);
     o->length = length;
@@ -103,8 +105,8 @@ INLINE void NAME(geometry)(const struct plant *p, double stiffness, ELEMENT *e, 
     o->radius = radius;
 }
 
-/* B: curvature between the elements a and b, b's work; asin(x)/x as a series in x^2 = t. Relative error below 2e-15 for
- * 0.3 rad between two elements, 2e-12 for 0.4, 2e-10 for 0.5; a robot that bends more sharply is made non-finite. */
+/* B: curvature between the elements a and b, b's work; asin(x)/x / 4 as a series in 4 x^2 = t. Relative error below 2e-15
+ * for 0.3 rad between two elements, 2e-12 for 0.4, 2e-10 for 0.5; a robot that bends more sharply is made non-finite. */
 INLINE void NAME(curvature)(const struct plant *p, double rigidity, const ELEMENT *a, const ELEMENT *b, const WORK *oa,
                             WORK *o)
 {
@@ -113,26 +115,29 @@ INLINE void NAME(curvature)(const struct plant *p, double rigidity, const ELEMEN
     z[0] = DOT(g + 3, f + 6) - DOT(g + 6, f + 3);
     z[1] = DOT(g + 6, f) - DOT(g, f + 6);
     z[2] = DOT(g, f + 3) - DOT(g + 3, f);
-    V t = 0.25 * DOT(z, z);
-    V s = 1.0 + t * (1.0 / 6 + t * (3.0 / 40 + t * (5.0 / 112 + t * (35.0 / 1152 + t * (63.0 / 2816
-          + t * (231.0 / 13312 + t * (143.0 / 10240 + t * (6435.0 / 557056 + t * (12155.0 / 1245184
-          + t * (46189.0 / 5505024 + t * (88179.0 / 12058624)))))))))));
-    V c = (V)((M)((0.5 * p->inverse_rest_length) * s) | (M)(t > 0.23));
+    V t = DOT(z, z), t2 = t * t, t4 = t2 * t2;
+#define C(n, a) ((a) / (4.0 * (1L << 2 * (n))))
+    V s0 = (C(0, 1.0) + t * C(1, 1.0 / 6)) + t2 * (C(2, 3.0 / 40) + t * C(3, 5.0 / 112));
+    V s1 = (C(4, 35.0 / 1152) + t * C(5, 63.0 / 2816)) + t2 * (C(6, 231.0 / 13312) + t * C(7, 143.0 / 10240));
+    V s2 = (C(8, 6435.0 / 557056) + t * C(9, 12155.0 / 1245184))
+           + t2 * (C(10, 46189.0 / 5505024) + t * C(11, 88179.0 / 12058624));
+#undef C
+    V c = (V)((M)(s0 + t4 * (s1 + t4 * s2)) | (M)(t > 0.92));
     V inverse = 2.0 / (oa->length + o->length);
-    V squeeze = p->rest_length * inverse;
-    V cube = rigidity * (squeeze * squeeze * squeeze);
-    V quarter = 0.25 * (oa->radius + o->radius);
+    V cube = inverse * inverse * (rigidity * inverse);
+    V bend = p->bend[0] * cube, twist = p->bend[1] * cube;
+    V radii = oa->radius + o->radius;
     for (int i = 0; i < 3; i++) {
         o->kappa[i] = c * z[i];
-        o->couple[i] = p->bend[i] * o->kappa[i] * cube;
-        o->curl[i] = quarter * o->kappa[i];
+        o->couple[i] = (i < 2 ? bend : twist) * o->kappa[i];
+        o->curl[i] = radii * o->kappa[i];
     }
-    o->slope = 0.5 * (o->radius - oa->radius) * inverse;
+    o->slope = (o->radius - oa->radius) * inverse;
 }
 
 /* One actuator of an element: its force is added to n, its couple about the centre line to pair. */
-INLINE void NAME(pull)(const struct plant *p, int axis, const DRIVE *drive, const V *curl, V slope, V squeeze,
-                       const WORK *o, V *n, V *pair)
+INLINE void NAME(pull)(const struct plant *p, int axis, const DRIVE *drive, const V *curl, V slope, const WORK *o,
+                       V *n, V *pair)
 {
     V x = drive->place, y = o->radius * x, t[3];
     t[axis] = o->strain[axis] + slope * x;
@@ -141,7 +146,7 @@ INLINE void NAME(pull)(const struct plant *p, int axis, const DRIVE *drive, cons
     V local = NAME(root)(DOT(t, t));
     V weight = p->weight[0] + local * (p->weight[1] + local * (p->weight[2] + local * p->weight[3]));
     M slack = (M)(weight < 0.0) | (M)(local > p->longest);
-    V f = (V)((M)(drive->force * weight * squeeze / local) & ~slack);
+    V f = (V)((M)(drive->force * o->inverse * weight / local) & ~slack);
     for (int i = 0; i < 3; i++) {
         t[i] *= f;
         n[i] += t[i];
@@ -182,12 +187,11 @@ INLINE void NAME(forces)(const struct plant *p, int rubs, const DRIVE *drive, EL
         n[i] = o->stress[i];
     }
     V slope = o->slope + after->slope;
-    V squeeze = p->rest_length * o->inverse;
     for (int a = 0; a < p->actuators; a++)
         if (p->axis[a])
-            NAME(pull)(p, 1, drive + a, curl, slope, squeeze, o, n, pair);
+            NAME(pull)(p, 1, drive + a, curl, slope, o, n, pair);
         else
-            NAME(pull)(p, 0, drive + a, curl, slope, squeeze, o, n, pair);
+            NAME(pull)(p, 0, drive + a, curl, slope, o, n, pair);
     for (int i = 0; i < 3; i++) {
         V x = o->drag[0] + n[0], y = o->drag[1] + n[1], z = o->drag[2] + n[2];
         o->front[i] = q[i] * x + q[3 + i] * y + q[6 + i] * z;
@@ -195,17 +199,16 @@ INLINE void NAME(forces)(const struct plant *p, int rubs, const DRIVE *drive, EL
         o->back[i] = q[i] * x + q[3 + i] * y + q[6 + i] * z;
         o->force[i] = n[i];
         o->pair[i] = pair[i];
-        m[i] = o->couple[i] + 0.5 * (before->pair[i] + pair[i]);
+        m[i] = o->couple[i] + (before->pair[i] + pair[i]);
     }
     const V *k = o->kappa;
     if (rubs)
         NAME(rub)(p, k, e->slip, m);
-    double half = 0.5 * p->rest_length;
     for (int i = 0; i < 3; i++)
         o->moment[i] = m[i];
-    o->turn[0] = half * (k[1] * m[2] - k[2] * m[1]);
-    o->turn[1] = half * (k[2] * m[0] - k[0] * m[2]);
-    o->turn[2] = half * (k[0] * m[1] - k[1] * m[0]);
+    o->turn[0] = k[1] * m[2] - k[2] * m[1];
+    o->turn[1] = k[2] * m[0] - k[0] * m[2];
+    o->turn[2] = k[0] * m[1] - k[1] * m[0];
 }
 
 /* D: kick of the element and of the node before it. */
@@ -214,22 +217,25 @@ INLINE void NAME(kick)(const struct plant *p, double mobility, ELEMENT *e, const
 {
     const V *s = o->strain, *n = o->force;
     V w[3] = {e->omega[0], e->omega[1], e->omega[2]};
+    V spin = p->gyration[0] * w[2], square = o->length * o->length;
+    V turn[2], fade[2];
+    for (int i = 0; i < 2; i++) {
+        turn[i] = p->turn_kick[i] * o->length;
+        fade[i] = p->gyration[i] * o->rate - p->fade_kick[i] * square;
+    }
     V torque[3] = {s[1] * n[2] - s[2] * n[1], s[2] * n[0] - s[0] * n[2], s[0] * n[1] - s[1] * n[0]};
-    V stretch = o->length * p->inverse_rest_length;
     for (int i = 0; i < 3; i++) {
-        V t = (o->turn[i] + after->turn[i]) + (after->moment[i] - o->moment[i]) + p->rest_length * torque[i];
-        V fade = p->gyration[i] * o->rate - p->fade_kick[i] * (o->length * stretch);
-        e->omega[i] += p->turn_kick[i] * (stretch * t) + fade * w[i];
+        V t = (o->turn[i] + after->turn[i]) + (after->moment[i] - o->moment[i]) + torque[i];
+        e->omega[i] += turn[i / 2] * t + fade[i / 2] * w[i];
         e->velocity[i] += mobility * (before->back[i] + o->front[i]);
     }
-    e->omega[0] -= p->gyration[0] * (w[1] * w[2]);
-    e->omega[1] += p->gyration[1] * (w[0] * w[2]);
+    e->omega[0] -= spin * w[1];
+    e->omega[1] += spin * w[0];
     e->velocity[2] += p->gravity_kick;
 }
 
-/* One time step: drift by h, then kick. The first node and element are clamped: at rest, and never kicked. */
-INLINE void NAME(sweep)(const struct plant *p, int rubs, int elements, int per_module, const DRIVE *drive, ELEMENT *e,
-                        double h)
+/* One time step: drift, then kick. The first node and element are clamped: at rest, and never kicked. */
+INLINE void NAME(sweep)(const struct plant *p, int rubs, int elements, int per_module, const DRIVE *drive, ELEMENT *e)
 {
     const double *mobility = p->mobility, *stiffness = p->stiffness, *rigidity = p->rigidity;
     WORK ring[RING];
@@ -238,7 +244,7 @@ INLINE void NAME(sweep)(const struct plant *p, int rubs, int elements, int per_m
     for (int k = 0; k < elements + LAG_D; k++) {
         int c = k - LAG_C, d = k - LAG_D;
         if (k < elements)
-            NAME(geometry)(p, stiffness[k], e + k, AT(k), h);
+            NAME(geometry)(p, stiffness[k], e + k, AT(k));
         if (k > 0 && k < elements)
             NAME(curvature)(p, rigidity[k - 1], e + k - 1, e + k, AT(k - 1), AT(k));
         else if (k == elements)
@@ -266,28 +272,37 @@ INLINE void NAME(follow)(const struct plant *p, int drives, DRIVE *drive)
     }
 }
 
+/* Drift of all elements by `part` of a time step. */
+static void NAME(drift)(int elements, ELEMENT *e, double part)
+{
+    for (int k = 0; k < elements; k++) {
+        V w[3];
+        for (int i = 0; i < 3; i++) {
+            w[i] = part * e[k].omega[i];
+            e[k + 1].position[i] += part * e[k + 1].velocity[i];
+        }
+        NAME(rotate)(e[k].director, w);
+    }
+}
+
 static void NAME(advance)(const struct plant *p, int block, int modules, int per_module, double *drives,
                           double *state, long steps)
 {
     int elements = modules * per_module;
     ELEMENT *e = (ELEMENT *)state + (long)block * (elements + 1);
     DRIVE *drive = (DRIVE *)drives + (long)block * modules * p->actuators;
-    double h = 0.5 * p->time_step;
+    if (steps <= 0)
+        return;
+    NAME(drift)(elements, e, -0.5); /* every sweep drifts by a whole time step, the first one by half */
     for (long s = 0; s < steps; s++) {
         if (p->lags)
             NAME(follow)(p, modules * p->actuators, drive);
         if (p->friction > 0.0)
-            NAME(sweep)(p, 1, elements, per_module, drive, e, h);
+            NAME(sweep)(p, 1, elements, per_module, drive, e);
         else
-            NAME(sweep)(p, 0, elements, per_module, drive, e, h);
-        h = p->time_step;
+            NAME(sweep)(p, 0, elements, per_module, drive, e);
     }
-    h = steps ? 0.5 * p->time_step : 0.0;
-    for (int k = 0; k < elements; k++) {
-        NAME(rotate)(e[k].director, e[k].omega, h);
-        for (int i = 0; i < 3; i++)
-            e[k + 1].position[i] += h * e[k + 1].velocity[i];
-    }
+    NAME(drift)(elements, e, 0.5);
 }
 
 /* The most that the core can do, for the benchmark: 12 chains of multiply-adds that wait for nobody. */

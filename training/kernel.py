@@ -28,15 +28,12 @@ class PlantStruct(ctypes.Structure):
         ("actuators", ctypes.c_int64),
         ("axis", ctypes.c_int64 * MOST_ACTUATORS),
         ("lags", ctypes.c_int64),
-        ("time_step", ctypes.c_double),
-        ("rest_length", ctypes.c_double),
-        ("inverse_rest_length", ctypes.c_double),
-        ("volume_over_pi", ctypes.c_double),
+        ("tiny", ctypes.c_double),
         ("shear", ctypes.c_double),
         ("stretch", ctypes.c_double),
-        ("bend", ctypes.c_double * 3),
+        ("bend", ctypes.c_double * 2),
         ("half_damping", ctypes.c_double),
-        ("drag", ctypes.c_double * 3),
+        ("drag", ctypes.c_double * 2),
         ("weight", ctypes.c_double * 4),
         ("longest", ctypes.c_double),
         ("valve_share", ctypes.c_double),
@@ -44,9 +41,9 @@ class PlantStruct(ctypes.Structure):
         ("friction", ctypes.c_double),
         ("friction_curvature", ctypes.c_double),
         ("gravity_kick", ctypes.c_double),
-        ("gyration", ctypes.c_double * 3),
-        ("turn_kick", ctypes.c_double * 3),
-        ("fade_kick", ctypes.c_double * 3),
+        ("gyration", ctypes.c_double * 2),
+        ("turn_kick", ctypes.c_double * 2),
+        ("fade_kick", ctypes.c_double * 2),
         ("mobility", ctypes.c_void_p),
         ("stiffness", ctypes.c_void_p),
         ("rigidity", ctypes.c_void_p),
@@ -85,21 +82,21 @@ def variants() -> list[str]:
 
 
 def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct:
-    """The plant as the kernel wants it, without the three arrays. The rod's own numbers are PyElastica's: a disk's
+    """The plant in the kernel's units, without the three arrays. The rod's own numbers are PyElastica's: a disk's
     second moments, 27/28 for the shear of a section, a third of Young's modulus for shear."""
     length = plant.module_length_m / plant.elements
     area = math.pi * plant.radius_m**2
     moment = area**2 / (4 * math.pi)
     young, shear = plant.youngs_modulus_pa, plant.youngs_modulus_pa / 3
     inertia = plant.rotary_inertia_ratio * plant.density_kg_m3 * length * moment
-    inertias = (inertia, inertia, 2 * inertia)
+    inertias = (inertia, 2 * inertia)
     # Explicit: the damping torque is kicked like any other. Exponential: each kick is weighted as the exact solution of
     # dw/dt = a - c w weights a, which is stable at any c; c at rest length.
-    kick = [time_step_s] * 3
+    kick = [time_step_s] * 2
     if damping == "exponential":
         rates = [plant.torque_damping_n_s * length / each for each in inertias]
         kick = [-math.expm1(-rate * time_step_s) / rate if rate else time_step_s for rate in rates]
-    drag = np.array([plant.drag_transverse, plant.drag_transverse, plant.drag_axial])
+    velocity = length / time_step_s  # its unit, m/s
     actuators = plant.actuators
     axes, _ = places(plant)
     lags = (actuators.valve_lag_s, actuators.chamber_lag_s)
@@ -110,25 +107,24 @@ def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct
         actuators=len(axes),
         axis=tuple(axes),
         lags=any(lags),
-        time_step=time_step_s,
-        rest_length=length,
-        inverse_rest_length=1 / length,
-        volume_over_pi=area * length / math.pi,
+        tiny=1e-14 / length,
         shear=27 / 28 * shear * area,
         stretch=plant.axial_ratio * young * area,
-        bend=(young * moment, young * moment, 2 * shear * moment),
-        half_damping=0.5 * plant.damping_n_s_m2,
-        drag=tuple(0.5 * drag / (plant.radius_m * length)),
+        bend=(2 * young * moment / length**2, 4 * shear * moment / length**2),
+        half_damping=-0.5 * plant.damping_n_s_m2 * length * (0.5 * velocity),
+        drag=tuple(0.5 * each * (0.5 * velocity) ** 2 for each in (plant.drag_transverse, plant.drag_axial)),
         weight=(*actuators.weight, 0.0, 0.0, 0.0)[:4],
         longest=actuators.longest,
         valve_share=shares[0],
         chamber_share=shares[1],
-        friction=plant.friction_n_m2,
-        friction_curvature=plant.friction_curvature_per_m,
-        gravity_kick=time_step_s * plant.gravity_m_s2,
-        gyration=tuple(kick),
-        turn_kick=tuple(each / j for each, j in zip(kick, inertias, strict=True)),
-        fade_kick=tuple(each * plant.torque_damping_n_s / j for each, j in zip(kick, inertias, strict=True)),
+        friction=2 * plant.friction_n_m2 / length**2,
+        friction_curvature=0.5 * plant.friction_curvature_per_m * length,
+        gravity_kick=time_step_s * plant.gravity_m_s2 / velocity,
+        gyration=tuple(each / time_step_s for each in kick),
+        turn_kick=tuple(each * time_step_s * length / j for each, j in zip(kick, inertias, strict=True)),
+        fade_kick=tuple(
+            each * plant.torque_damping_n_s * length / j for each, j in zip(kick, inertias, strict=True)
+        ),
     )
 
 
