@@ -8,14 +8,13 @@
 #include <immintrin.h>
 #endif
 
-enum { MOST_ACTUATORS = 4 };
+enum { ACTUATORS = 2 }; /* that act on a module at a time */
 
 /* One kind of robot; what makes its elements unlike stands in the three arrays. fleet.py fills it in, field by field.
  * Units: the rest length of an element, the time step, and newton; so a velocity is in rest lengths a time step. */
 struct plant {
-    int64_t actuators;            /* that act on a module at a time */
-    int64_t axis[MOST_ACTUATORS]; /* 0 or 1: the director that each of them stands along */
-    int64_t lags;                 /* whether the actuators follow their goal late */
+    int64_t second;             /* 0 or 1: the director that the second actuator is along; the first is along 0 */
+    int64_t lags;               /* whether the actuators follow their goal late */
     double tiny;                /* added to the length of an element, as PyElastica does */
     double shear, stretch;      /* stiffness of a section */
     double bend[2];             /* and twist: couple of half a curvature, at rigidity 1 */

@@ -2,8 +2,11 @@
  *
  * The rod, its loads and position Verlet are PyElastica's (arm.py, loads.py), with the two half drifts between time
  * steps merged. One sweep along the rod is one time step. Its stages follow each other a few elements apart: A drift
- * and geometry of element k, B curvature between k - 1 and k, C actuators and stress, D kick. What a stage hands to the
- * next stands in a short ring. No lane ever looks at another one, so a robot's numbers do not depend on its place.
+ * and geometry of element k, B curvature between k - 1 and k, C actuators and stress, D kick. What a stage passes to the
+ * next is in a short ring. No lane reads another one, so a robot's numbers do not depend on its place.
+ *
+ * A and C are in two parts, 1 and 2, with other stages in between: the square roots and divisions of the first part take
+ * long, and a processor that cannot look far enough ahead would wait for them.
  *
  * Three short cuts in the algebra, exact but for rounding. With N = stress / stretch + actuator force (material frame):
  * the force between nodes is Q^T N, and the couple of both is rest length * (strain + e3) x N. What transport of the
@@ -23,7 +26,7 @@ struct NAME(element) {
 };
 
 struct NAME(drive) {
-    V goal, valve, force, place; /* N at weight 1; place along the actuator's axis over the current radius */
+    V goal, valve, force, place; /* N at weight 1; place along the actuator's axis: half of it, at rest */
 };
 
 struct NAME(work) {
@@ -32,9 +35,15 @@ struct NAME(work) {
     V pair[3], force[3], front[3], back[3], moment[3], turn[3];     /* C; forces on the node before and the one after */
 };
 
+struct NAME(passed) {
+    V d[3], v[3];     /* from A1 to A2: between the nodes, and the sum of their velocities */
+    V pull[ACTUATORS][3], share[ACTUATORS]; /* from C1 to C2: the stretched line of an actuator, and its force over that */
+};
+
 #define ELEMENT struct NAME(element)
 #define WORK struct NAME(work)
 #define DRIVE struct NAME(drive)
+#define PASSED struct NAME(passed)
 
 INLINE V NAME(root)(V x)
 {
@@ -68,41 +77,47 @@ INLINE void NAME(rotate)(V *restrict q, const V *restrict w)
     }
 }
 
-/* A: drift of the element and of the node after it by a time step; length, strain, stress, damping and drag. */
-INLINE void NAME(geometry)(const struct plant *p, double stiffness, ELEMENT *e, WORK *o)
+/* A1: drift of the element and of the node after it by a time step; length. */
+INLINE void NAME(lengths)(const struct plant *p, ELEMENT *e, WORK *o, PASSED *between)
 {
-    V d[3], dv[3], v[3], u[3];
+    V d[3], dv[3];
     for (int i = 0; i < 3; i++) {
         e[1].position[i] += e[1].velocity[i];
         d[i] = e[1].position[i] - e[0].position[i];
         dv[i] = e[1].velocity[i] - e[0].velocity[i];
-        v[i] = e[1].velocity[i] + e[0].velocity[i];
+        between->d[i] = d[i];
+        between->v[i] = e[1].velocity[i] + e[0].velocity[i];
     }
-    NAME(rotate)(e->director, e->omega);
     V length = NAME(root)(DOT(d, d)) + p->tiny;
     V inverse = 1.0 / length;
-    V radius = NAME(root)(inverse);
+    o->rate = DOT(d, dv) * (inverse * inverse);
+    o->length = length;
+    o->inverse = inverse;
+    o->radius = NAME(root)(inverse);
+}
+
+/* A2: rotation of the element by a time step; strain, stress, damping and drag. */
+INLINE void NAME(strains)(const struct plant *p, double stiffness, ELEMENT *e, WORK *o, const PASSED *between)
+{
+    V u[3];
+    NAME(rotate)(e->director, e->omega);
     for (int i = 0; i < 3; i++) {
         const V *row = e->director + 3 * i;
-        o->strain[i] = DOT(row, d);
-        u[i] = DOT(row, v);
+        o->strain[i] = DOT(row, between->d);
+        u[i] = DOT(row, between->v);
     }
-    V firm = stiffness * inverse;
+    V firm = stiffness * o->inverse;
     V shear = p->shear * firm;
     o->stress[0] = shear * o->strain[0];
     o->stress[1] = shear * o->strain[1];
     o->stress[2] = p->stretch * firm * (o->strain[2] - 1.0);
-    V damping = p->half_damping * length;
-    V section = radius * length;
+    V damping = p->half_damping * o->length;
+    V section = o->radius * o->length;
     V across = p->drag[0] * section, along = p->drag[1] * section;
     for (int i = 0; i < 3; i++) {
         V speed = (V)((M)u[i] & INT64_MAX);
         o->drag[i] = (damping - (i < 2 ? across : along) * speed) * u[i];
     }
-    o->rate = DOT(d, dv) * (inverse * inverse);
-    o->length = length;
-    o->inverse = inverse;
-    o->radius = radius;
 }
 
 /* B: curvature between the elements a and b, b's work; asin(x)/x / 4 as a series in 4 x^2 = t. Relative error below 2e-15
@@ -111,6 +126,7 @@ INLINE void NAME(curvature)(const struct plant *p, double rigidity, const ELEMEN
                             WORK *o)
 {
     const V *f = a->director, *g = b->director;
+    V inverse = 2.0 / (oa->length + o->length);
     V z[3];
     z[0] = DOT(g + 3, f + 6) - DOT(g + 6, f + 3);
     z[1] = DOT(g + 6, f) - DOT(g, f + 6);
@@ -123,7 +139,6 @@ INLINE void NAME(curvature)(const struct plant *p, double rigidity, const ELEMEN
            + t2 * (C(10, 46189.0 / 5505024) + t * C(11, 88179.0 / 12058624));
 #undef C
     V c = (V)((M)(s0 + t4 * (s1 + t4 * s2)) | (M)(t > 0.92));
-    V inverse = 2.0 / (oa->length + o->length);
     V cube = inverse * inverse * (rigidity * inverse);
     V bend = p->bend[0] * cube, twist = p->bend[1] * cube;
     V radii = oa->radius + o->radius;
@@ -135,28 +150,23 @@ INLINE void NAME(curvature)(const struct plant *p, double rigidity, const ELEMEN
     o->slope = (o->radius - oa->radius) * inverse;
 }
 
-/* One actuator of an element: its force is added to n, its couple about the centre line to pair. */
-INLINE void NAME(pull)(const struct plant *p, int axis, const DRIVE *drive, const V *curl, V slope, const WORK *o,
-                       V *n, V *pair)
+/* C1: the force of each actuator of an element. The second one is along axis `second`. */
+INLINE void NAME(pulls)(const struct plant *p, int second, const DRIVE *drive, const WORK *o, const WORK *after,
+                        PASSED *between)
 {
-    V x = drive->place, y = o->radius * x, t[3];
-    t[axis] = o->strain[axis] + slope * x;
-    t[1 - axis] = axis ? o->strain[0] - curl[2] * x : o->strain[1] + curl[2] * x;
-    t[2] = axis ? o->strain[2] + curl[0] * x : o->strain[2] - curl[1] * x;
-    V local = NAME(root)(DOT(t, t));
-    V weight = p->weight[0] + local * (p->weight[1] + local * (p->weight[2] + local * p->weight[3]));
-    M slack = (M)(weight < 0.0) | (M)(local > p->longest);
-    V f = (V)((M)(drive->force * o->inverse * weight / local) & ~slack);
-    for (int i = 0; i < 3; i++) {
-        t[i] *= f;
-        n[i] += t[i];
-    }
-    if (axis) {
-        pair[0] += y * t[2];
-        pair[2] -= y * t[0];
-    } else {
-        pair[1] -= y * t[2];
-        pair[2] += y * t[1];
+    V curl[3], slope = o->slope + after->slope;
+    for (int i = 0; i < 3; i++)
+        curl[i] = o->curl[i] + after->curl[i];
+    for (int a = 0; a < ACTUATORS; a++) {
+        int axis = a == 1 ? second : 0;
+        V x = drive[a].place, *t = between->pull[a];
+        t[axis] = o->strain[axis] + slope * x;
+        t[1 - axis] = axis ? o->strain[0] - curl[2] * x : o->strain[1] + curl[2] * x;
+        t[2] = axis ? o->strain[2] + curl[0] * x : o->strain[2] - curl[1] * x;
+        V local = NAME(root)(DOT(t, t));
+        V weight = (p->weight[1] + local * (p->weight[2] + local * p->weight[3])) + p->weight[0] / local;
+        M slack = (M)(weight < 0.0) | (M)(local > p->longest); /* weight: over local, which is positive */
+        between->share[a] = (V)((M)(drive[a].force * o->inverse * weight) & ~slack);
     }
 }
 
@@ -176,22 +186,28 @@ INLINE void NAME(rub)(const struct plant *p, const V *kappa, V *slip, V *m)
     m[1] += p->friction * d1;
 }
 
-/* C: actuators, forces on the two nodes, and the couple towards the element before. */
-INLINE void NAME(forces)(const struct plant *p, int rubs, const DRIVE *drive, ELEMENT *e, const WORK *before, WORK *o,
-                         const WORK *after)
+/* C2: forces on the two nodes, and the couple towards the element before. */
+INLINE void NAME(forces)(const struct plant *p, int rubs, int second, const DRIVE *drive, ELEMENT *e, const WORK *before,
+                         WORK *o, const PASSED *between)
 {
     const V *q = e->director;
-    V curl[3], pair[3] = {{0}}, n[3], m[3];
-    for (int i = 0; i < 3; i++) {
-        curl[i] = o->curl[i] + after->curl[i];
+    V pair[3] = {{0}}, n[3], m[3];
+    for (int i = 0; i < 3; i++)
         n[i] = o->stress[i];
+    for (int a = 0; a < ACTUATORS; a++) {
+        V y = o->radius * drive[a].place, t[3];
+        for (int i = 0; i < 3; i++) {
+            t[i] = between->pull[a][i] * between->share[a];
+            n[i] += t[i];
+        }
+        if (a == 1 && second) {
+            pair[0] += y * t[2];
+            pair[2] -= y * t[0];
+        } else {
+            pair[1] -= y * t[2];
+            pair[2] += y * t[1];
+        }
     }
-    V slope = o->slope + after->slope;
-    for (int a = 0; a < p->actuators; a++)
-        if (p->axis[a])
-            NAME(pull)(p, 1, drive + a, curl, slope, o, n, pair);
-        else
-            NAME(pull)(p, 0, drive + a, curl, slope, o, n, pair);
     for (int i = 0; i < 3; i++) {
         V x = o->drag[0] + n[0], y = o->drag[1] + n[1], z = o->drag[2] + n[2];
         o->front[i] = q[i] * x + q[3 + i] * y + q[6 + i] * z;
@@ -234,31 +250,70 @@ INLINE void NAME(kick)(const struct plant *p, double mobility, ELEMENT *e, const
     e->velocity[2] += p->gravity_kick;
 }
 
-/* One time step: drift, then kick. The first node and element are clamped: at rest, and never kicked. */
-INLINE void NAME(sweep)(const struct plant *p, int rubs, int elements, int per_module, const DRIVE *drive, ELEMENT *e)
+/* What one turn of the sweep works on, at the front element k. */
+struct NAME(front) {
+    const struct plant *plant;
+    ELEMENT *elements;
+    WORK *ring;
+    const DRIVE *drive; /* of the module of element k - LAG_C */
+    int count;
+};
+
+/* All stages, each on its element if `inside` or if the rod has that element. Within a turn A1, A2 and B need this order,
+ * and C1 and C2; the rest of the order is for speed. With AVX-512 all of A and B first is a tenth faster. */
+INLINE void NAME(turn)(const struct NAME(front) *f, int inside, int rubs, int second, int k)
 {
-    const double *mobility = p->mobility, *stiffness = p->stiffness, *rigidity = p->rigidity;
+#define AT(k) (f->ring + ((k) & (RING - 1)))
+    const struct plant *p = f->plant;
+    ELEMENT *e = f->elements;
+    PASSED between;
+    int c = k - LAG_C, d = k - LAG_D;
+    int has_a = inside || k < f->count, has_b = inside || (k > 0 && k < f->count);
+    int has_c = inside || (c >= 0 && c < f->count), has_d = inside || d > 0;
+    int early = LANES == 8;
+    if (has_a)
+        NAME(lengths)(p, e + k, AT(k), &between);
+    if (has_a && early)
+        NAME(strains)(p, p->stiffness[k], e + k, AT(k), &between);
+    if (has_b && early)
+        NAME(curvature)(p, p->rigidity[k - 1], e + k - 1, e + k, AT(k - 1), AT(k));
+    if (has_c)
+        NAME(pulls)(p, second, f->drive, AT(c), AT(c + 1), &between);
+    if (has_a && !early)
+        NAME(strains)(p, p->stiffness[k], e + k, AT(k), &between);
+    if (has_d)
+        NAME(kick)(p, p->mobility[d], e + d, AT(d - 1), AT(d), AT(d + 1));
+    if (has_b && !early)
+        NAME(curvature)(p, p->rigidity[k - 1], e + k - 1, e + k, AT(k - 1), AT(k));
+    if (has_c)
+        NAME(forces)(p, rubs, second, f->drive, e + c, AT(c - 1), AT(c), &between);
+    if (!inside && k == f->count)
+        *AT(k) = (WORK){0}; /* nothing bends after the last element */
+    if (!inside && c == 0)
+        for (int i = 0; i < 3; i++)
+            AT(0)->moment[i] = AT(0)->turn[i] = (V){0};
+}
+
+/* One time step: drift, then kick. The first node and element are clamped: at rest, and never kicked. */
+INLINE void NAME(sweep)(const struct plant *p, int rubs, int second, int elements, int per_module, const DRIVE *drive,
+                        ELEMENT *e)
+{
     WORK ring[RING];
-#define AT(k) (ring + ((k) & (RING - 1)))
+    struct NAME(front) front = {p, e, ring, drive, elements}, *f = &front;
+    int left = per_module + LAG_C; /* turns until stage C comes to the next module */
     *AT(0) = *AT(-1) = (WORK){0}; /* nothing bends before the first element */
     for (int k = 0; k < elements + LAG_D; k++) {
-        int c = k - LAG_C, d = k - LAG_D;
-        if (k < elements)
-            NAME(geometry)(p, stiffness[k], e + k, AT(k));
-        if (k > 0 && k < elements)
-            NAME(curvature)(p, rigidity[k - 1], e + k - 1, e + k, AT(k - 1), AT(k));
-        else if (k == elements)
-            *AT(k) = (WORK){0}; /* nor after the last one */
-        if (c >= 0 && c < elements)
-            NAME(forces)(p, rubs, drive + p->actuators * (c / per_module), e + c, AT(c - 1), AT(c), AT(c + 1));
-        if (c == 0)
-            for (int i = 0; i < 3; i++)
-                AT(0)->moment[i] = AT(0)->turn[i] = (V){0};
-        if (d > 0)
-            NAME(kick)(p, mobility[d], e + d, AT(d - 1), AT(d), AT(d + 1));
+        if (left-- == 0) {
+            front.drive += ACTUATORS;
+            left = per_module - 1;
+        }
+        if (k > LAG_D && k < elements)
+            NAME(turn)(f, 1, rubs, second, k);
+        else
+            NAME(turn)(f, 0, rubs, second, k);
     }
     for (int i = 0; i < 3; i++)
-        e[elements].velocity[i] += mobility[elements] * AT(elements - 1)->back[i];
+        e[elements].velocity[i] += p->mobility[elements] * AT(elements - 1)->back[i];
     e[elements].velocity[2] += p->gravity_kick;
 #undef AT
 }
@@ -290,17 +345,21 @@ static void NAME(advance)(const struct plant *p, int block, int modules, int per
 {
     int elements = modules * per_module;
     ELEMENT *e = (ELEMENT *)state + (long)block * (elements + 1);
-    DRIVE *drive = (DRIVE *)drives + (long)block * modules * p->actuators;
+    DRIVE *drive = (DRIVE *)drives + (long)block * modules * ACTUATORS;
     if (steps <= 0)
         return;
     NAME(drift)(elements, e, -0.5); /* every sweep drifts by a whole time step, the first one by half */
     for (long s = 0; s < steps; s++) {
         if (p->lags)
-            NAME(follow)(p, modules * p->actuators, drive);
-        if (p->friction > 0.0)
-            NAME(sweep)(p, 1, elements, per_module, drive, e);
+            NAME(follow)(p, modules * ACTUATORS, drive);
+        if (p->friction > 0.0 && p->second)
+            NAME(sweep)(p, 1, 1, elements, per_module, drive, e);
+        else if (p->friction > 0.0)
+            NAME(sweep)(p, 1, 0, elements, per_module, drive, e);
+        else if (p->second)
+            NAME(sweep)(p, 0, 1, elements, per_module, drive, e);
         else
-            NAME(sweep)(p, 0, elements, per_module, drive, e);
+            NAME(sweep)(p, 0, 0, elements, per_module, drive, e);
     }
     NAME(drift)(elements, e, 0.5);
 }
@@ -326,3 +385,4 @@ static double NAME(peak)(long rounds)
 #undef ELEMENT
 #undef WORK
 #undef DRIVE
+#undef PASSED

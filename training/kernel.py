@@ -18,15 +18,13 @@ Damping = Literal["exponential", "explicit"]
 
 VARIANTS = ("plain", "avx2", "avx512")  # by the instructions they need
 LIMIT = "MODSOFT_KERNEL"  # environment variable: the highest variant to use; unset or empty: no limit
-MOST_ACTUATORS = 4
 
 
 class PlantStruct(ctypes.Structure):
     """`struct plant` of fleet.c, field by field."""
 
     _fields_ = (
-        ("actuators", ctypes.c_int64),
-        ("axis", ctypes.c_int64 * MOST_ACTUATORS),
+        ("second", ctypes.c_int64),
         ("lags", ctypes.c_int64),
         ("tiny", ctypes.c_double),
         ("shear", ctypes.c_double),
@@ -104,8 +102,7 @@ def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct
     if len(actuators.weight) > 4:
         raise ModsoftError(f"an actuator's weight has {len(actuators.weight)} coefficients, expected at most 4")
     return PlantStruct(
-        actuators=len(axes),
-        axis=tuple(axes),
+        second=axes[1],
         lags=any(lags),
         tiny=1e-14 / length,
         shear=27 / 28 * shear * area,
@@ -122,9 +119,7 @@ def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct
         gravity_kick=time_step_s * plant.gravity_m_s2 / velocity,
         gyration=tuple(each / time_step_s for each in kick),
         turn_kick=tuple(each * time_step_s * length / j for each, j in zip(kick, inertias, strict=True)),
-        fade_kick=tuple(
-            each * plant.torque_damping_n_s * length / j for each, j in zip(kick, inertias, strict=True)
-        ),
+        fade_kick=tuple(each * plant.torque_damping_n_s * length / j for each, j in zip(kick, inertias, strict=True)),
     )
 
 
@@ -139,10 +134,11 @@ def places(plant: Plant) -> tuple[list[int], list[float]]:
         raise ModsoftError(f"actuators at {actuators.angles_deg} degrees; expected 0, 90, 180 or 270")
     if alternate(plant):
         degrees = degrees[::2]
-    if len(degrees) > MOST_ACTUATORS:
-        raise ModsoftError(f"{len(degrees)} actuators act at a time, expected at most {MOST_ACTUATORS}")
+    axes = [int(each) for each in degrees // 90.0 % 2]
+    if axes not in ([0, 0], [0, 1]):
+        raise ModsoftError(f"actuators that act at a time along axes {axes}, expected [0, 0] or [0, 1]")
     signs = np.where(degrees < 180.0, 1.0, -1.0)
-    return [int(each) for each in degrees // 90.0 % 2], [float(each) for each in actuators.offset_ratio * signs]
+    return axes, [float(each) for each in actuators.offset_ratio * signs]
 
 
 def alternate(plant: Plant) -> bool:

@@ -1,6 +1,7 @@
 """The fast plant against PyElastica, against the recorded runs, and against itself in other places of a batch."""
 
 import importlib.util
+import json
 from pathlib import Path
 
 import numpy as np
@@ -296,9 +297,22 @@ def test_the_benchmark_measures_prints_and_draws(tmp_path):
     assert [row["robots"] for row in result["rows"]] == [1, 8]
     assert all(row["fleet_us"] > 0 and 0 < row["share_of_peak"] < 1 for row in result["rows"])
     assert all(row["ratio"] == row["elastica_us"] / row["fleet_us"] for row in result["rows"])
-    assert benchmark.table(result).count("| pneumatic | 2 |") == 2
-    benchmark.draw(result, tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+    assert result["variant"] == kernel.variants()[-1]
+    assert result["two_threads"]["ratio_to_peak"] > 0
+    assert benchmark.table(result).count("| pneumatic | 2 | 8 |") == 1
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{benchmark.BEGIN}\nold\n{benchmark.END}\nafter\n", encoding="utf-8")
+    benchmark.write_report(result, page)
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("before\n")
+    assert text.endswith("\nafter\n")
+    assert "old" not in text
+    assert benchmark.table(result) in text
+    assert json.loads((tmp_path / "page" / f"{result['variant']}.json").read_text())["rows"] == result["rows"]
+    assert (tmp_path / "page" / f"{result['variant']}.png").read_bytes().startswith(b"\x89PNG")
+    page.write_text("no marks\n", encoding="utf-8")
+    with pytest.raises(UsageError, match="expected one line"):
+        benchmark.write_report(result, page)
 
 
 @pytest.mark.parametrize("count", [1, 20])

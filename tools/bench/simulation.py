@@ -1,11 +1,12 @@
-"""What a time step of a simulated robot costs: the fleet against PyElastica, one robot and eight in a memory block.
+"""Performance of the simulation kernel: a time step of the fleet against PyElastica, one robot and eight in a block.
 
-`python tools/bench/simulation.py`; `--compare` shows instead how far the two are apart.
+`python tools/bench/simulation.py --isa native|avx2 --report docs/simulation.md`; `--compare` shows instead how far the
+two are apart.
 
-Everything is measured in one run, in short turns that follow each other, so that what else the machine does meets all
-alike; a figure is the least processor time of its turns, and only one core against two is by the wall clock. The share
-of the core's peak counts the arithmetic in fleet_kernel.h by hand (a multiply-add is two operations, a division or a
-root one), against multiply-adds that wait for nothing.
+Everything is measured in one run, in short turns that follow each other, so that other load on the machine affects all
+alike; a figure is the least processor time of its turns, and only two threads against one are by the wall clock. The
+share of the core's peak counts the arithmetic in fleet_kernel.h by hand (a multiply-add is two operations, a division
+or a root one), against independent multiply-adds with vectors of the same width.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from __future__ import annotations
 import json
 import os
 import platform
-import sys
+import subprocess
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +27,7 @@ import elastica
 import numpy as np
 
 from modsoft.runtime.command import entry
-from modsoft.runtime.errors import DeviceAbsent, ModsoftError
+from modsoft.runtime.errors import DeviceAbsent, ModsoftError, UsageError
 from modsoft.training import kernel, plotting
 from modsoft.training.arm import Arm, _Loads, _Simulator
 from modsoft.training.fleet import Fleet
@@ -34,11 +36,13 @@ from modsoft.training.robots import PLANTS, Plant
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OPERATIONS_PER_ELEMENT = {"cable": 454, "pneumatic": 480}
+OPERATIONS_PER_ELEMENT = {"cable": 416, "pneumatic": 434}
 ACTIONS = {"cable": 2, "pneumatic": 1}
 BLOCK = 8
 PEAK_ROUNDS = 2_000_000
 TURNS_A_PERIOD = 4  # a turn is a quarter of a control period
+PAGE_ROWS = [(modules, 8) for modules in (2, 4, 12)]  # (modules, robots) in the table; the JSON file has all rows
+BEGIN, END = "<!-- performance: written by tools/bench/simulation.py -->", "<!-- end of performance -->"
 
 
 class Block:
@@ -94,20 +98,27 @@ def least_seconds(calls: dict[Any, Callable[[], object]], rounds: int, clock: Ca
     return least
 
 
-def two_cores(rounds: int) -> dict[str, float]:
-    """Robot-steps a second by the wall clock: four-module robots on one thread and on two."""
+def two_threads(variant: int, rounds: int) -> dict[str, float]:
+    """Robot-steps a second of four-module robots on one thread and on two, by the wall clock, and what independent
+    multiply-adds gain from the second thread in the same turns."""
+    library = kernel.library()
     drawn = 0.5 * np.random.default_rng(0).uniform(-1, 1, (32, 4, 2))
     fleets = {threads: Fleet("cable", 4, 32, threads=threads) for threads in (1, 2)}
-    calls = {threads: lambda robots=robots: robots.step(drawn) for threads, robots in fleets.items()}
-    seconds = least_seconds(calls, rounds, time.perf_counter)
+    calls: dict[Any, Callable[[], object]] = {
+        threads: lambda robots=robots: robots.step(drawn) for threads, robots in fleets.items()
+    }
+    with ThreadPoolExecutor(2) as pool:
+        for threads in fleets:
+            parts = [8 * PEAK_ROUNDS // threads] * threads
+            calls["peak", threads] = lambda parts=parts: list(pool.map(lambda n: library.fleet_peak(variant, n), parts))
+        seconds = least_seconds(calls, rounds, time.perf_counter)
     per_second = {f"threads_{threads}": 32 * 4000 / seconds[threads] for threads in fleets}
-    return {**per_second, "ratio": seconds[1] / seconds[2]}
+    gain, peak_gain = seconds[1] / seconds[2], seconds["peak", 1] / seconds["peak", 2]
+    return {**per_second, "ratio": gain, "peak_ratio": peak_gain, "ratio_to_peak": gain / peak_gain}
 
 
 def measured(kinds: list[str], module_numbers: list[int], counts: list[int], rounds: int) -> dict[str, Any]:
-    library, variant = kernel.library(), len(kernel.VARIANTS) - 1
-    while not library.fleet_lanes(variant):
-        variant -= 1
+    library, variant = kernel.library(), kernel.VARIANTS.index(kernel.variants()[-1])
     parts = {}
     for kind in kinds:
         for modules in module_numbers:
@@ -148,13 +159,23 @@ def measured(kinds: list[str], module_numbers: list[int], counts: list[int], rou
     return {
         "processor": processor(),
         "cores": os.cpu_count(),
+        "commit": commit(),
         "load_average": os.getloadavg()[0],
         "pyelastica": version("pyelastica"),
         "variant": kernel.VARIANTS[variant],
         "peak_gflop_s": 1e-9 * peak,
         "rows": rows,
-        "two_cores": two_cores(rounds),
+        "two_threads": two_threads(variant, rounds),
     }
+
+
+def commit() -> str:
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
+    try:
+        git = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    except OSError:
+        return "unknown"
+    return git.stdout.strip() or "unknown"
 
 
 def processor() -> str:
@@ -166,15 +187,18 @@ def processor() -> str:
 
 
 def table(result: dict[str, Any]) -> str:
-    cores = result["two_cores"]
+    threads = result["two_threads"]
     lines = [
-        f"{result['processor']}, kernel {result['variant']}, peak {result['peak_gflop_s']:.0f} GFLOP/s a core, "
-        f"load {result['load_average']:.1f}; microseconds of processor time for a time step of one robot",
+        f"Kernel {result['variant']}: {result['processor']}, {result['cores']} cores, commit {result['commit']}, load "
+        f"{result['load_average']:.1f}, peak {result['peak_gflop_s']:.0f} GFLOP/s a core, PyElastica "
+        f"{result['pyelastica']}. Microseconds of processor time for a time step of one robot:",
         "",
         "| kind | modules | robots | fleet | PyElastica | its block of 8 | ratio | ratio to block | share of peak |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for row in result["rows"]:
+        if (row["modules"], row["robots"]) not in PAGE_ROWS:
+            continue
         lines.append(
             f"| {row['kind']} | {row['modules']} | {row['robots']} | {row['fleet_us']:.3f} | {row['elastica_us']:.1f} "
             f"| {row['elastica_block_us']:.1f} | {row['ratio']:.1f} | {row['ratio_block']:.1f} "
@@ -182,10 +206,33 @@ def table(result: dict[str, Any]) -> str:
         )
     lines += [
         "",
-        f"32 four-module cable robots by the wall clock: {cores['threads_1'] / 1e6:.2f} million robot-steps a second "
-        f"on one thread, {cores['threads_2'] / 1e6:.2f} on two: {cores['ratio']:.2f} times.",
+        f"32 four-module cable robots by the wall clock: {threads['threads_1'] / 1e6:.2f} million robot-steps a second "
+        f"on one thread, {threads['threads_2'] / 1e6:.2f} on two: {threads['ratio']:.2f} times. Multiply-adds alone "
+        f"gain {threads['peak_ratio']:.2f} times from the second thread: the kernel gains "
+        f"{threads['ratio_to_peak']:.2f} of that.",
     ]
     return "\n".join(lines)
+
+
+def write_report(result: dict[str, Any], page: Path) -> None:
+    """Keeps `result` in the folder named like `page`, one JSON file and one picture for each kernel variant, and writes
+    the tables of all of them into the page, between its two marks. `UsageError` if it has no such marks."""
+    text = page.read_text(encoding="utf-8")
+    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
+        raise UsageError(f"{page}: expected one line {BEGIN} and one line {END} after it")
+    folder = page.with_suffix("")
+    folder.mkdir(exist_ok=True)
+    (folder / f"{result['variant']}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    draw(result, folder / f"{result['variant']}.png")
+    parts = []
+    for variant in kernel.VARIANTS:
+        path = folder / f"{variant}.json"
+        if path.exists():
+            caption = f"Microseconds for a time step of one robot, over the number of modules, kernel {variant}"
+            parts.append(table(json.loads(path.read_text(encoding="utf-8"))))
+            parts.append(f"![{caption}]({folder.name}/{variant}.png)")
+    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
+    page.write_text("\n\n".join([before, *parts, after]), encoding="utf-8")
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -239,14 +286,31 @@ def compared(kinds: list[str], module_numbers: list[int], periods: int) -> list[
 
 @click.command(help=__doc__)
 @click.option("--kind", "kinds", multiple=True, type=click.Choice(list(PLANTS)), help="Default: all.")
+@click.option(
+    "--isa", type=click.Choice(["native", "avx2"]), default="native", show_default=True, help="Instruction set."
+)
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all figures here, one JSON object.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Write a picture here (PNG).")
+@click.option(
+    "--report", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Page to update (Markdown)."
+)
 @click.option("--quick", is_flag=True, help="Fewer sizes and turns: less than a minute.")
 @click.option("--compare", is_flag=True, help="How far fleet and PyElastica are apart after 50 periods; minutes.")
-def main(kinds: tuple[str, ...], json_file: Path | None, picture: Path | None, quick: bool, compare: bool) -> None:
+def main(
+    kinds: tuple[str, ...],
+    isa: str,
+    json_file: Path | None,
+    picture: Path | None,
+    report: Path | None,
+    quick: bool,
+    compare: bool,
+) -> None:
     if kernel.library() is None:
-        click.echo("the fleet's kernel is not built; expected a C compiler at installation: make install", err=True)
-        sys.exit(DeviceAbsent.exit_code)
+        raise DeviceAbsent("the fleet's kernel is not built; expected a C compiler at installation: make install")
+    if isa == "avx2":
+        os.environ[kernel.LIMIT] = "avx2"
+        if kernel.variants()[-1] != "avx2":
+            raise UsageError("this processor has no AVX2, expected one that has; leave --isa out")
     chosen = list(kinds or PLANTS)
     if compare:
         rows = compared(chosen, [2, 4] if quick else [2, 3, 4, 6, 12], 5 if quick else 50)
@@ -257,6 +321,8 @@ def main(kinds: tuple[str, ...], json_file: Path | None, picture: Path | None, q
         click.echo(table(result))
         if picture:
             draw(result, picture)
+        if report:
+            write_report(result, report)
     if json_file:
         json_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
