@@ -36,9 +36,9 @@ def pressures_bar(robot: Robot, actuation: Array) -> Array:
 def channel_pressures_bar(robot: Robot, actuation: Array, channels: int = 12) -> Array:
     """What the board is sent: pressure set-points (channels,), bar, each chamber on its channel with its gain and
     offset, never outside 0 to p_max_bar; 0 on channels without a chamber."""
-    pressures, out = pressures_bar(robot, actuation), np.zeros(channels)
+    pressures, out = pressures_bar(robot, actuation).tolist(), [0.0] * channels
     largest_bar = robot.valve.p_max_bar if robot.valve else 0.0
     for chamber in robot.chambers:
-        pressure = pressures[chamber.module - 1, "+-".index(chamber.side)]
-        out[chamber.channel] = np.clip(chamber.gain * pressure + chamber.offset_bar, 0.0, largest_bar)
-    return out
+        pressure = pressures[chamber.module - 1]["+-".index(chamber.side)]
+        out[chamber.channel] = min(max(chamber.gain * pressure + chamber.offset_bar, 0.0), largest_bar)
+    return np.array(out)

@@ -21,6 +21,8 @@ from modsoft.runtime.robot import KINDS, Robot
 
 Array = NDArray[np.float64]
 
+LARGEST = float(np.finfo(np.float32).max)  # a larger feature is infinite in the network
+
 # What a session raises for a graph that it cannot take.
 REFUSED = (
     onnxruntime_errors.Fail,
@@ -238,23 +240,22 @@ class Controller:
         """Features (N, F) of this control step to actuation (N, A), not limited. Raises `ModelError` for fewer than
         two modules, another number than the network is bound to, another number of features, or anything not finite,
         in or out."""
-        with np.errstate(over="ignore"):  # a value too large for float32 is infinite there, and refused below
-            narrowed = np.asarray(features, dtype=np.float64).astype(np.float32)
-        if narrowed.ndim != 2 or narrowed.shape[0] < 2 or narrowed.shape[1] != self.unit.feature_size:
+        features = np.asarray(features, dtype=np.float64)
+        if features.ndim != 2 or features.shape[0] < 2 or features.shape[1] != self.unit.feature_size:
             raise ModelError(
-                f"{self.where}: features of shape {narrowed.shape}, expected (N, {self.unit.feature_size}) with N >= 2"
+                f"{self.where}: features of shape {features.shape}, expected (N, {self.unit.feature_size}) with N >= 2"
             )
-        if self.unit.modules not in (None, len(narrowed)):
+        if self.unit.modules not in (None, len(features)):
             raise ModelError(
-                f"{self.where}: a robot of {len(narrowed)} modules; the network {self.description.network.name} is "
+                f"{self.where}: a robot of {len(features)} modules; the network {self.description.network.name} is "
                 f"bound to {self.unit.modules}, a biLSTM serves any number"
             )
-        finite = np.isfinite(narrowed)
-        if not finite.all():
-            module, feature = np.argwhere(~finite)[0]
+        size = np.abs(features)
+        if not size.max() <= LARGEST:
+            module, feature = np.argwhere(~(size <= LARGEST))[0]
             name = self.description.features[feature]
             raise ModelError(f"{self.where}: feature {name} of module {module + 1} is not finite; nothing was computed")
-        actuation = self.unit.whole(narrowed)
+        actuation = self.unit.whole(features)
         if not np.isfinite(actuation).all():
             raise ModelError(f"{self.where}: the actuation is not finite although every feature is")
         return actuation

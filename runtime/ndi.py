@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Callable
@@ -67,7 +68,7 @@ class NDI:
             return None
         self._errors = 0
         # A tool that was left out of the answer has number 0, so the newest number is the frame's.
-        number = int(np.nanmax(np.asarray(numbers, dtype=np.float64)))
+        number = int(max(number for number in numbers if not math.isnan(number)))
         if number == self._newest:
             return None
         self._newest = number
@@ -84,14 +85,18 @@ class NDI:
 
 def matrices(quaternions: NDArray[np.float64], translations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Poses (n, 4, 4) from unit quaternions (n, 4), w first, and translations (n, 3), mm; NaN stays NaN."""
-    w, x, y, z = quaternions.T
-    poses = np.zeros((len(quaternions), 4, 4))
-    poses[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1)
-    poses[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1)
-    poses[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1)
-    poses[:, :3, 3] = translations
-    poses[:, 3, 3] = 1.0
-    return poses
+    rows = zip(np.asarray(quaternions).tolist(), np.asarray(translations).tolist(), strict=True)
+    return np.array([_matrix(*quaternion, *translation) for quaternion, translation in rows])
+
+
+def _matrix(w: float, x: float, y: float, z: float, x_mm: float, y_mm: float, z_mm: float) -> list[list[float]]:
+    """One pose (4, 4); a few numbers of Python are faster than arrays of a few numbers."""
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), x_mm],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), y_mm],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), z_mm],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
 
 
 def _checked(kind: str, tools: list[Path], count: int) -> list[Path]:

@@ -516,7 +516,7 @@ def test_restart_between_two_looks_is_seen_by_the_boot_id(rig):
     assert "restarted by itself" in board.lost
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -0.01, 0.3501])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e308, -0.01, 0.3501])
 def test_no_wild_set_point_is_sent(rig, bad):
     board, port = rig
     board.arm(ROBOT)

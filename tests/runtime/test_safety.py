@@ -123,6 +123,15 @@ def test_what_is_not_finite_never_becomes_a_configuration(tool, entry, value):
     assert judged.word == safety.NOT_FINITE
 
 
+@pytest.mark.filterwarnings("ignore:(overflow|invalid value):RuntimeWarning")
+def test_axes_too_large_for_a_length_are_distorted():
+    """Their components along each other are infinite, or no numbers at all."""
+    for axes in (np.full((3, 3), 1e200), np.array([[1e200, -1e200, 0.0]] * 3)):
+        poses = planar_poses((5.0, 30.0, 80.0))
+        poses[1:3, :3, :3] = axes
+        assert FrameJudge(ROBOT).judge(frame(1, 1.0, poses=poses), 1.01).word == safety.DISTORTED
+
+
 # ---- what is waited out
 
 
