@@ -8,6 +8,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 SLICE_S = 0.05  # waiting is cut into slices so that a lost device is noticed between two ticks
+SPIN_S = 0.001
+
+
+def spinning(
+    wait: Callable[[float], object], now: Callable[[], float] = time.monotonic
+) -> Callable[[float], object]:
+    """`wait` for a `Ticker`, but without sleep where at most a millisecond is left: what sleeps loses the processor,
+    and its caches, to other processes."""
+
+    def wait_or_spin(seconds: float) -> None:
+        if seconds > SPIN_S:
+            wait(seconds)
+            return
+        until_s = now() + seconds
+        while now() < until_s:
+            pass
+
+    return wait_or_spin
 
 
 @dataclass(frozen=True)
@@ -64,15 +82,23 @@ class Ticker:
         """A command has just been sent."""
         self._sent_s = self.now()
 
-    def next(self, idle: Callable[[], None] = lambda: None) -> Tick:
-        """Waits for the next slot. `idle` is called at least once, then every 50 ms; what it raises goes through."""
+    def next(
+        self, idle: Callable[[], None] = lambda: None, prepare: Callable[[float], float] = lambda left_s: left_s
+    ) -> Tick:
+        """Waits for the next slot. `idle` is called at least once, then every 50 ms; what it raises goes through.
+
+        `prepare` is called before every wait with the seconds that are left, and returns how many of them to wait: it
+        may use a part of the time, and returns 0 to be called again at once.
+        """
         index = self._index + 1
         idle()
         while True:
             left_s = max(self.due_s(index), self._sent_s + self.period_s / 2) - self.now()
             if left_s > 0:
-                self._wait(min(left_s, SLICE_S))
-                idle()
+                wait_s = min(left_s, SLICE_S, prepare(left_s))
+                if wait_s > 0:
+                    self._wait(wait_s)
+                    idle()
             elif self.too_late(index):
                 behind = (self.now() - self._start_s) / self.period_s - 0.5
                 index = max(index + 1, math.ceil(behind))

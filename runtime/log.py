@@ -25,7 +25,8 @@ that the loop never waits for a disk and a killed process loses nothing. A tick:
 
 Other lines have "event" in place of "tick": "start" (mono_ns, commanded_bar: actuation 0, one period before step 0),
 "done" (mono_ns, acknowledged: one period after the last step), "end" (mono_ns when venting began, exit_code, reason,
-vented: whether the board said so, vented_ns: when). What is not a number is null.
+vented: whether the board said so, vented_ns: when), "warm-up failed" (reason: the error that ended the warm-up of the
+caches; the control steps go on). What is not a number is null.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from modsoft.runtime.stop import Stop
 from modsoft.runtime.tally import Tally
 from modsoft.runtime.tracker import Frame, Slot
 from modsoft.runtime.trajectory import ahead
+from modsoft.runtime.warmup import WarmUp
 
 Array = NDArray[np.float64]
 
@@ -70,6 +71,7 @@ class Loop:
     log: Callable[[dict[str, Any]], None]
     tally: Tally
     correction: Correction = field(default_factory=NoCorrection)
+    warm_up: WarmUp | None = None
 
     def run(self, rest: Array) -> None:
         """Runs the whole task from `rest` (N, 3), the configuration of the vented robot; the board is armed.
@@ -90,8 +92,13 @@ class Loop:
         self.ticker.start(robot.loop.period_s)
         self.log({"event": "start", "mono_ns": began_ns, "commanded_bar": bar})
         targets, step = ahead(self.desired), -1
+        warm_up = self.warm_up
+
+        def prepare(left_s: float) -> float:
+            return warm_up.before(left_s, self.slot.latest(), window, applied) if warm_up is not None else left_s
+
         while True:
-            tick = self.ticker.next(self._idle)
+            tick = self.ticker.next(self._idle, prepare)
             acknowledged = self._acknowledged(step, sequence)
             guard.missed(min(tick.index, len(self.desired)) - step - 1)
             for _ in range(tick.missed):  # the valves held what they had
@@ -104,8 +111,10 @@ class Loop:
             frame = self.slot.latest()
             judged = self.judge.judge(frame, self.ticker.now())
             desired = self.desired[step]
-            line = self._begun(tick, frame, judged, desired, acknowledged)
-            line |= {"sent": False, "aim": None, "raw": None, "actuation": applied, "commanded_bar": None}
+            # What the step begins with is read before the set-points change it, the line is made after they are sent.
+            wall, board, link = datetime.now(UTC), self._board(), self.valves.statistics
+            outcome: dict[str, Any] = {"sent": False, "aim": None, "raw": None, "actuation": applied}
+            outcome |= {"commanded_bar": None}
             try:
                 guard.frame(judged)
                 actuation = applied  # held where there is no good frame
@@ -113,8 +122,8 @@ class Loop:
                     state = state_of(judged.configuration, kind)
                 window.observe(state)
                 if judged.configuration is not None:
-                    line["aim"] = aim = self.correction.aim(targets[step], desired, judged.configuration)
-                    line["raw"] = raw = self.model.actuate(window.features(state_of(aim, kind)))
+                    outcome["aim"] = aim = self.correction.aim(targets[step], desired, judged.configuration)
+                    outcome["raw"] = raw = self.model.actuate(window.features(state_of(aim, kind)))
                     check_actuation(raw)
                     actuation = limited(raw, applied, robot.limits.largest_actuation_step)
                     self.correction.answered(raw, actuation)
@@ -123,7 +132,7 @@ class Loop:
                     sequence = self.valves.set_pressures(step + 1, bar)
                     self.ticker.sent()
                     applied = actuation
-                    line |= {"sent": True, "actuation": applied, "commanded_bar": bar}
+                    outcome |= {"sent": True, "actuation": applied, "commanded_bar": bar}
                     guard.on_time()
                 else:
                     sequence = None  # the acknowledgement of the step before is not this one's
@@ -131,9 +140,19 @@ class Loop:
                     guard.missed(1)
                 window.applied(applied)
             finally:  # the step that ended a run is the one that everybody wants to see
-                line["step_ms"] = (self.ticker.now() - tick.start_s) * 1e3
+                outcome["step_ms"] = (self.ticker.now() - tick.start_s) * 1e3
+                line = {
+                    **_begun(tick, wall, frame, judged),
+                    "desired": desired,
+                    "board": board,
+                    "acknowledged": acknowledged,
+                    "link": link,
+                    **outcome,
+                }
                 self.log(line)
             self.tally.add(line, tick, judged)
+            if warm_up is not None:
+                warm_up.step_took(outcome["step_ms"] * 1e-3)
 
     def _idle(self) -> None:
         """Between two ticks: whether anybody wants to stop, and whether everybody is still there."""
@@ -157,46 +176,45 @@ class Loop:
             self.tally.acknowledged(told["ms"])
         return told
 
-    def _begun(
-        self, tick: Tick, frame: Frame | None, judged: Judgement, desired: Array, acknowledged: dict[str, Any]
-    ) -> dict[str, Any]:
-        """The first half of a tick's line of the log: what was known before anything was decided."""
-        seen = None
-        if frame is not None:
-            seen = {
-                "number": frame.device_frame,
-                "mono_ns": _ns(frame.monotonic_s),
-                "age_ms": None if judged.age_s is None else judged.age_s * 1e3,
-                "poses": frame.poses,
-                "valid": frame.valid,
-                "quality": frame.quality,
-            }
-        status, board = self.valves.status, None
-        if status is not None:
-            board = {
-                "state": State(status.state).name if status.state in set(State) else str(status.state),
-                "faults": status.faults,
-                "tick": status.tick,
-                "applied_bar": self.valves.applied_bar,
-                "measured_bar": self.valves.measured_bar,
-                "age_ms": self.valves.status_age_s * 1e3,
-            }
+    def _board(self) -> dict[str, Any] | None:
+        """The last status of the board, for the log; None before the first."""
+        status = self.valves.status
+        if status is None:
+            return None
         return {
-            "tick": tick.index,
-            "mono_ns": _ns(tick.start_s),
-            "due_ns": _ns(tick.due_s),
-            "wall": datetime.now(UTC).isoformat(timespec="milliseconds"),
-            "late_ms": tick.lateness_s * 1e3,
-            "missed": tick.missed,
-            "verdict": judged.word,
-            "detail": judged.detail,
-            "frame": seen,
-            "configuration": judged.configuration,
-            "desired": desired,
-            "board": board,
-            "acknowledged": acknowledged,
-            "link": self.valves.statistics,
+            "state": State(status.state).name if status.state in set(State) else str(status.state),
+            "faults": status.faults,
+            "tick": status.tick,
+            "applied_bar": self.valves.applied_bar,
+            "measured_bar": self.valves.measured_bar,
+            "age_ms": self.valves.status_age_s * 1e3,
         }
+
+
+def _begun(tick: Tick, wall: datetime, frame: Frame | None, judged: Judgement) -> dict[str, Any]:
+    """The first part of a tick's line of the log: when it began, and with which frame."""
+    seen = None
+    if frame is not None:
+        seen = {
+            "number": frame.device_frame,
+            "mono_ns": _ns(frame.monotonic_s),
+            "age_ms": None if judged.age_s is None else judged.age_s * 1e3,
+            "poses": frame.poses,
+            "valid": frame.valid,
+            "quality": frame.quality,
+        }
+    return {
+        "tick": tick.index,
+        "mono_ns": _ns(tick.start_s),
+        "due_ns": _ns(tick.due_s),
+        "wall": wall.isoformat(timespec="milliseconds"),
+        "late_ms": tick.lateness_s * 1e3,
+        "missed": tick.missed,
+        "verdict": judged.word,
+        "detail": judged.detail,
+        "frame": seen,
+        "configuration": judged.configuration,
+    }
 
 
 def _ns(seconds: float) -> int:

@@ -24,7 +24,7 @@ from modsoft.runtime import correction
 from modsoft.runtime import log as logs
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board import Board
-from modsoft.runtime.clock import Ticker
+from modsoft.runtime.clock import Ticker, spinning
 from modsoft.runtime.configuration import bending_angle_deg
 from modsoft.runtime.controller import Controller
 from modsoft.runtime.display import StatusLine
@@ -49,6 +49,7 @@ from modsoft.runtime.stop import Keys, Signals, Stop, StopKey
 from modsoft.runtime.tally import Tally
 from modsoft.runtime.tracker import Reader, Slot, open_source, port_of
 from modsoft.runtime.trajectory import load_task, task_of
+from modsoft.runtime.warmup import WarmUp
 
 Array = NDArray[np.float64]
 
@@ -132,8 +133,9 @@ def run(options: Options) -> None:
             with StatusLine(lambda: _status(tally, log), sys.stderr):
                 Loop(
                     robot, controller, desired, slot, judge, board or Rehearsal(),
-                    Ticker(robot.loop.period_s, time.monotonic, stop.wait), stop, log.put, tally,
+                    Ticker(robot.loop.period_s, time.monotonic, spinning(stop.wait)), stop, log.put, tally,
                     correction.named(options.correction, robot.modules),
+                    WarmUp(robot, controller.actuate, judge, log.put),
                 ).run(rest)  # fmt: skip
         except BaseException as raised:  # noqa: BLE001 - raised again below, after the venting
             error = raised

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modsoft.runtime.clock import SLICE_S, Ticker
+from modsoft.runtime.clock import SLICE_S, SPIN_S, Ticker, spinning
 
 
 class Time:
@@ -156,3 +156,33 @@ def test_a_command_that_was_held_up_puts_off_the_next_slot():
     tick = ticker.next()
     assert (tick.index, tick.missed) == (3, 1)
     assert tick.start_s == pytest.approx(1000.0 + 1.2)
+
+
+def test_a_preparation_uses_time_of_the_wait_and_delays_no_slot():
+    time = Time()
+    ticker = time.ticker()
+    ticker.next()
+    used_at = []
+
+    def prepare(left_s):
+        if left_s > 0.011:
+            return left_s - 0.01
+        if left_s > 0.005:
+            used_at.append(left_s)
+            time.time_s += 0.004
+            return 0.0
+        return left_s
+
+    tick = ticker.next(prepare=prepare)
+    assert used_at == pytest.approx([0.01, 0.006])
+    assert tick.lateness_s == pytest.approx(0.0, abs=1e-9)
+
+
+def test_only_the_last_millisecond_is_waited_without_sleep():
+    slept, times = [], itertools.count(0.0, SPIN_S / 4)
+    wait = spinning(slept.append, lambda: next(times))
+    wait(0.4)
+    assert slept == [0.4]
+    wait(SPIN_S)
+    assert slept == [0.4]
+    assert next(times) >= 5 * SPIN_S / 4

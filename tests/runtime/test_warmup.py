@@ -1,0 +1,135 @@
+"""The warm-up before a control step, on virtual time: it changes no result, delays no step, and ends no run."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+from virtual_loop import PERIOD_S, ROBOT, World, spoils
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.clock import SPIN_S
+from modsoft.runtime.configuration import Window
+from modsoft.runtime.errors import ModelError
+from modsoft.runtime.log import plain
+from modsoft.runtime.warmup import LEAD, MARGIN, RUNS, WarmUp
+
+RUN_S = 0.0004  # what a run takes
+
+
+class Warmed(World):
+    """A world whose loop has a warm-up; `runs`: when it called the model."""
+
+    def __init__(self, answer=lambda: np.full((3, 1), 0.1), **options):
+        super().__init__(**options)
+        self.runs = []
+        self.run_s = RUN_S
+        self.warm_answer = answer
+        self.warm_up = WarmUp(self.robot, self.rehearse, self.loop.judge, self.log, lambda: self.time_s)
+        self.loop = dataclasses.replace(self.loop, warm_up=self.warm_up)
+
+    def rehearse(self, features):
+        self.runs.append(self.time_s)
+        self.time_s += self.run_s
+        return self.warm_answer()
+
+
+def test_it_runs_shortly_before_a_step_and_no_step_is_late():
+    world = Warmed(steps=10).run()
+    assert len(world.runs) == RUNS * 10  # before all steps but the first, and before the end
+    before_s = [min(due - at for due in map(world.due_s, range(11)) if due > at) for at in world.runs]
+    assert max(before_s) <= LEAD * world.work_s + SPIN_S + 1e-6
+    assert min(before_s) >= MARGIN * RUN_S - 1e-6
+    assert max(line["late_ms"] for line in world.ticks) < 1e-3
+
+
+def test_nothing_that_is_sent_or_logged_differs():
+    plainly, warmed = World(steps=8), Warmed(steps=8)
+    for world in (plainly, warmed):
+        hidden = spoils(valid=np.array([True, True, False, True]))
+        world.spoilt = [(world.due_s(3) - 0.1, world.due_s(4) - 0.1, hidden)]
+        world.answer = lambda features: features[:, :1] * 2.0 + 0.3
+        world.run()
+    assert warmed.runs
+    assert [line["verdict"] for line in warmed.ticks] == ["good"] * 3 + ["tool hidden"] + ["good"] * 4
+    np.testing.assert_array_equal([s[2] for s in plainly.sent], [s[2] for s in warmed.sent])
+    np.testing.assert_array_equal(plainly.features, warmed.features)
+    for one, other in zip(plainly.ticks, warmed.ticks, strict=True):
+        for name in ("verdict", "configuration", "aim", "raw", "actuation", "commanded_bar", "sent", "missed"):
+            assert plain(one[name]) == plain(other[name]), name
+
+
+def test_it_changes_neither_the_judge_nor_the_window():
+    world = Warmed()
+    window = Window(3, np.array([[0.0, 1.0]] * 3), 1)
+    judge_before, rows_before = copy.deepcopy(vars(world.loop.judge)), window.features(np.zeros((3, 2)))
+    world.warm_up.step_took(0.001)
+    assert world.warm_up.before(0.003, world.frame(angles=(9.0, 9.0, 9.0)), window, np.zeros((3, 1))) == 0.0
+    assert len(world.runs) == 1
+    assert repr(judge_before) == repr(vars(world.loop.judge))
+    np.testing.assert_array_equal(window.features(np.zeros((3, 2))), rows_before)
+
+
+@pytest.mark.parametrize(
+    ("step_s", "period_s"),
+    [(0.02, PERIOD_S), (0.002, 0.05), (0.0, PERIOD_S)],
+    ids=["slow computer", "short period", "coarse clock"],
+)
+def test_without_enough_time_it_never_runs(step_s, period_s):
+    table = ROBOT.to_dict()
+    table["loop"] |= {"hz": 1.0 / period_s, "task": ""}
+    world = Warmed(robot=robots.from_dict(table))
+    world.warm_up.step_took(step_s)
+    window, applied = Window(3, np.array([[0.0, 1.0]] * 3), 1), np.zeros((3, 1))
+    for left_s in np.linspace(0.0001, period_s, 50):
+        assert world.warm_up.before(left_s, world.frame(), window, applied) == left_s
+    assert world.runs == []
+
+
+@pytest.mark.parametrize("left_s", [MARGIN * 0.001 - 1e-5, 0.0005])
+def test_a_wait_that_ended_late_leaves_it_out(left_s):
+    world = Warmed()
+    world.warm_up.step_took(0.001)
+    window = Window(3, np.array([[0.0, 1.0]] * 3), 1)
+    assert world.warm_up.before(left_s, world.frame(), window, np.zeros((3, 1))) == left_s
+    assert world.runs == []
+
+
+def test_before_the_first_step_nothing_is_known_of_the_computer():
+    world = Warmed()
+    window = Window(3, np.array([[0.0, 1.0]] * 3), 1)
+    assert world.warm_up.before(0.003, world.frame(), window, np.zeros((3, 1))) == 0.003
+    assert world.runs == []
+
+
+def fail():
+    raise RuntimeError("no memory")
+
+
+@pytest.mark.parametrize("answer", [fail, lambda: np.full((3, 1), np.nan)])
+def test_an_error_in_it_is_logged_once_and_the_run_goes_on(answer):
+    world = Warmed(answer=answer, steps=6).run()
+    assert [line["sent"] for line in world.ticks] == [True] * 6
+    [event] = [line for line in world.lines if line.get("event") == "warm-up failed"]
+    assert event["reason"]
+    assert len(world.runs) == 1
+
+
+def test_an_error_that_persists_ends_the_run_as_without_it():
+    """The step that cannot be computed is in the log, and the error is the model's own."""
+    ends = []
+    for world in (World(steps=6), Warmed(answer=lambda: np.full((3, 1), np.nan), steps=6)):
+        world.answer = lambda features, world=world: np.full((3, 1), np.nan if len(world.features) == 3 else 0.1)
+        with pytest.raises(ModelError) as raised:
+            world.run()
+        last = world.ticks[-1]
+        ends.append((str(raised.value), last["tick"], last["sent"], len(world.sent)))
+    assert ends[0] == ends[1]
+
+
+def test_a_run_that_takes_long_is_not_repeated():
+    world = Warmed(steps=3)
+    world.run_s = 0.003
+    world.run()
+    assert len(world.runs) == 3  # one before each step but the first, and one before the end
+    assert max(line["late_ms"] for line in world.ticks) < 1e-3
