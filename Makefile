@@ -11,7 +11,7 @@ PYTEST := .venv/bin/python -m pytest
 INSTALLED := .venv/.installed
 MOVED := $(shell [ ! -e $(INSTALLED) ] || [ "$$(cat $(INSTALLED))" = "$$(pwd -P)" ] || echo moved)
 
-.PHONY: demo install test test-python test-cluster reliability soak check coverage mutation fuzz firmware clean moved
+.PHONY: demo install test test-python dist test-cluster reliability soak check coverage mutation fuzz firmware clean moved
 
 demo: $(INSTALLED)
 	.venv/bin/python tools/demo.py
@@ -28,6 +28,10 @@ test: $(INSTALLED)
 # The tests of runtime and export on every Python from 3.11 to 3.13 that is found.
 test-python: $(INSTALLED)
 	tools/test_pythons.sh
+
+# Wheel and source distribution into dist/, each installed and run, with and without a C compiler.
+dist: $(INSTALLED)
+	.venv/bin/python tools/dist.py
 
 # Collection through a real one-node SLURM, which the test installs and starts: root on Debian.
 test-cluster: $(INSTALLED)

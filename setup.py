@@ -5,8 +5,21 @@ serves. The vector width is chosen when it runs, so a wheel is for every process
 """
 
 from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+from setuptools.errors import CompileError
+
+
+class BuildKernel(build_ext):
+    """Leaves out at once what Microsoft's compiler cannot compile, instead of after a page of its errors."""
+
+    def build_extension(self, extension):
+        if self.compiler.compiler_type == "msvc":
+            raise CompileError("the simulation kernel needs GCC or Clang; PyElastica is used instead")
+        super().build_extension(extension)
+
 
 setup(
+    cmdclass={"build_ext": BuildKernel},
     ext_modules=[
         Extension(
             "modsoft.training._fleet",
@@ -15,5 +28,5 @@ setup(
             extra_compile_args=["-O3", "-fno-math-errno", "-ffp-contract=fast", "-Wno-psabi"],
             optional=True,
         )
-    ]
+    ],
 )

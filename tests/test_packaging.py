@@ -1,10 +1,12 @@
 """What a lab PC gets: the wheel with no extra, in an environment of its own."""
 
 import json
+import os
 import random
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -14,18 +16,44 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    """The wheel, built from a copy: setuptools would leave its build folder in the checkout."""
-    folder = tmp_path_factory.mktemp("wheel")
-    source = folder / "source"
+def source(tmp_path_factory):
+    """A copy of the checkout: setuptools would leave its build folder there."""
+    folder = tmp_path_factory.mktemp("source") / "modsoft"
     leave = shutil.ignore_patterns(
-        ".git", ".venv", "build", "demo", "runs", "out", "*.egg-info", "__pycache__", ".*_cache", "*.so"
+        ".git", ".venv", "build", "demo", "runs", "out", "*.egg-info", "__pycache__", ".*_cache", "*.so", "dist"
     )
-    shutil.copytree(ROOT, source, ignore=leave)
+    return shutil.copytree(ROOT, folder, ignore=leave)
+
+
+def build_wheel(source, folder, **environment):
     subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, source], check=True
-    )
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, source],
+        env={**os.environ, **environment}, check=True,
+    )  # fmt: skip
     return next(folder.glob("modsoft-*.whl"))
+
+
+@pytest.fixture(scope="module")
+def wheel(source, tmp_path_factory):
+    return build_wheel(source, tmp_path_factory.mktemp("wheel"))
+
+
+def test_without_a_c_compiler_the_wheel_is_built_without_the_kernel(source, tmp_path):
+    copy = shutil.copytree(source, tmp_path / "copy", ignore=shutil.ignore_patterns("build", "*.so", "*.egg-info"))
+    names = zipfile.ZipFile(build_wheel(copy, tmp_path, CC="false")).namelist()
+    assert "modsoft/training/fleet.py" in names
+    assert not [name for name in names if "_fleet" in name]
+
+
+def test_the_source_distribution_holds_all_that_a_build_needs(source, tmp_path):
+    command = [sys.executable, "-m", "build", "--sdist", "--outdir", tmp_path, source]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    needed = ("LICENSE", "README.md", "setup.py", "training/fleet.c", "training/fleet_kernel.h", "tools/hil/rig.py")
+    robots = [f"runtime/robots/{path.name}" for path in (ROOT / "runtime" / "robots").glob("*.toml")]
+    assert len(robots) >= 4
+    assert names.issuperset([*needed, *robots])
 
 
 def test_wheel_holds_the_five_parts_and_nothing_else(wheel):
