@@ -102,3 +102,15 @@ def test_a_real_run_gives_every_stage(latency, strong_model, tmp_path, monkeypat
     assert row["ticks"] > 10
     assert row["wire"]["p50_ms"] == pytest.approx(1.52)
     assert all(row[stage]["p50_ms"] > 0 for stage in latency.STAGES)
+
+
+def test_the_page_has_a_table_for_each_instruction_set(latency, tmp_path):
+    times = [{stage: 0.5 * ms for stage in (*latency.STAGES, "ours", "all")} for ms in (1, 2, 3)]
+    for isa, ms in (("avx2", 1.0), ("native", 3.0)):
+        rows = [{**latency.figures(2, 3, times), "warm": warm} for warm in (True, False)]
+        rows[0]["ours"]["p50_ms"] = ms
+        (tmp_path / f"{isa}.json").write_text(json.dumps({"about": latency.about(isa), "rows": rows}))
+    page = latency.document(tmp_path)
+    assert page.index("Instruction set avx2") < page.index("Instruction set native")
+    assert page.count("| 2 | yes | 3 | 1.00 (1.50) |") == page.count("| 2 | no | 3 | 1.00 (1.50) |") == 2
+    assert page.count("at the median: reached.") == page.count("at the median: missed with 2 modules.") == 1

@@ -1,7 +1,7 @@
 """From the tracker's answer to the valve's register: how long each stage takes, for robots of 2, 3 and 5 modules.
 
-`python tools/bench/latency.py`. The runtime's own loop runs on the emulated board and the fake tracker, with a stamp at
-every border; the robot is a swinging row of poses. The stages:
+`python tools/bench/latency.py --isa native|avx2`. The runtime's own loop runs on the emulated board and the fake
+tracker, with a stamp at every border; the robot is a swinging row of poses. The stages:
 
     frame          the client's answer (after the tracker's own line) to a frame in the loop's slot
     configuration  judged, eq. (1), the feature window
@@ -13,12 +13,17 @@ every border; the robot is a swinging row of poses. The stages:
 
 Between the first and the second a frame waits for the tick, which is no stage: it is the control rate. Ours is all but
 wire and firmware. The clock is CLOCK_MONOTONIC on both sides, so a busy machine shows: its load average is told.
+
+`--isa avx2` limits numpy. onnxruntime chooses its kernels by the processor and has no such switch.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import platform
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -34,13 +39,13 @@ from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board import Board
-from modsoft.runtime.clock import Ticker
+from modsoft.runtime.clock import Ticker, spinning
 from modsoft.runtime.command import entry
 from modsoft.runtime.configuration import from_angles_deg
 from modsoft.runtime.controller import Controller
-from modsoft.runtime.log import host
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.ndi import NDI
+from modsoft.runtime.ort import onnxruntime
 from modsoft.runtime.ports import open_port
 from modsoft.runtime.protocol import CHANNELS, Set, encode
 from modsoft.runtime.robot import Robot
@@ -48,7 +53,9 @@ from modsoft.runtime.safety import FrameJudge
 from modsoft.runtime.stop import Stop
 from modsoft.runtime.tally import Tally
 from modsoft.runtime.tracker import Reader, Slot
+from modsoft.runtime.warmup import WarmUp
 
+ROOT = Path(__file__).parents[2]
 MODULES = (2, 3, 5)
 HZ = 7.0  # faster than the robot, to have many ticks soon; the tracker's line takes 40 ms for six tools
 STAGES = ("frame", "configuration", "ONNX", "set-points", "serial", "wire", "firmware")
@@ -139,8 +146,9 @@ class StampedPort:
         return answer
 
 
-def ticks(modules: int, count: int, model: Path) -> list[dict[str, float]]:
-    """Milliseconds of every stage of every tick that went through all of them."""
+def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict[str, float]]:
+    """Milliseconds of every stage of every tick that went through all of them. `warm`: as the runtime, with its caches
+    warmed before every tick."""
     import ndicapy
 
     robot, stamps, lines, written = robot_of(modules, HZ), Stamps(), list[Stamps](), list[float]()
@@ -171,12 +179,14 @@ def ticks(modules: int, count: int, model: Path) -> list[dict[str, float]]:
                 if line.get("sent") and line["verdict"] == "good":
                     lines.append({**stamps, "number": line["frame"]["number"]})
 
+            judge = FrameJudge(robot)
             desired = np.repeat(from_angles_deg(np.zeros((1, modules))), count, axis=0)
             Loop(
                 robot, Stamped(controller, "actuate", stamps, "features", "answer"), desired, slot,
-                Stamped(FrameJudge(robot), "judge", stamps, "taken", "judged"),
+                Stamped(judge, "judge", stamps, "taken", "judged"),
                 Stamped(board, "set_pressures", stamps, "pressures", "handed"),
-                Ticker(robot.loop.period_s, time.monotonic, wait), stop, log, Tally(robot, count),
+                Ticker(robot.loop.period_s, time.monotonic, spinning(wait)), stop, log, Tally(robot, count),
+                warm_up=WarmUp(robot, controller.actuate, judge, log) if warm else None,
             ).run(from_angles_deg(np.zeros(modules)))  # fmt: skip
             board.close()
             reader.close()
@@ -218,35 +228,116 @@ def figures(modules: int, asked: int, found: list[dict[str, float]]) -> dict[str
     return row
 
 
+def about(isa: str) -> dict[str, Any]:
+    """Where, with what and on what commit a run was made."""
+    git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
+    return {
+        "isa": isa,
+        "processor": processor(),
+        "system": platform.platform(),
+        "cores": os.cpu_count(),
+        "numpy": np.__version__,
+        "onnxruntime": onnxruntime.__version__,
+        "commit": git.stdout.strip() or "unknown",
+        "load_average": os.getloadavg()[0],
+        "hz": HZ,
+        "target_ms": TARGET_MS,
+    }
+
+
+def processor() -> str:
+    """The processor's name and which vector instructions numpy uses of it."""
+    name = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [line.partition(":")[2].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
+        name = names[0] if names else name
+    return f"{name}, numpy with {', '.join(numpy_features()) or 'its baseline'}"
+
+
+def numpy_features() -> list[str]:
+    """The instruction sets above its baseline that numpy uses."""
+    return list(np.show_config(mode="dicts")["SIMD Extensions"].get("found", []))  # type: ignore[call-overload]
+
+
+def limited_to_avx2() -> dict[str, str]:
+    """The environment that keeps numpy from instruction sets beyond AVX2."""
+    wider = [name for name in numpy_features() if "512" in name or name == "X86_V4"]
+    return {"NPY_DISABLE_CPU_FEATURES": " ".join(wider)}
+
+
 def table(result: dict[str, Any]) -> str:
-    columns = (*STAGES, "ours", "all")
-    lines = [f"{result['system']}, {result['cores']} cores, load average {result['load_average']:.1f}; "
-             f"milliseconds, median (99th percentile); ours: all but wire and firmware", ""]  # fmt: skip
-    lines += ["| modules | ticks | " + " | ".join(columns) + " | all / wire |"]
-    lines += ["| ---: " * (len(columns) + 3) + "|"]
+    """One run in Markdown."""
+    columns, described = (*STAGES, "ours", "all"), result["about"]
+    lines = [f"Instruction set {described['isa']}: {described['processor']}; {described['cores']} cores, onnxruntime "
+             f"{described['onnxruntime']}, numpy {described['numpy']}, commit {described['commit']}, load average "
+             f"{described['load_average']:.1f}. Milliseconds, median (99th percentile).", ""]  # fmt: skip
+    lines += ["| modules | warm-up | ticks | " + " | ".join(columns) + " | all / wire |"]
+    lines += ["| ---: | --- " + "| ---: " * (len(columns) + 2) + "|"]
     for row in result["rows"]:
         cells = [f"{row[name]['p50_ms']:.2f} ({row[name]['p99_ms']:.2f})" for name in columns]
-        lines.append(f"| {row['modules']} | {row['ticks']} | {' | '.join(cells)} | {row['all_over_wire']:.1f} |")
-    over = [str(row["modules"]) for row in result["rows"] if row["ours"]["p50_ms"] > TARGET_MS]
+        warm = "yes" if row["warm"] else "no"
+        lines.append(
+            f"| {row['modules']} | {warm} | {row['ticks']} | {' | '.join(cells)} | {row['all_over_wire']:.1f} |"
+        )
+    over = [str(row["modules"]) for row in result["rows"] if row["warm"] and row["ours"]["p50_ms"] > TARGET_MS]
     verdict = f"missed with {', '.join(over)} modules" if over else "reached"
     return "\n".join([*lines, "", f"All but wire and firmware within {TARGET_MS:g} ms at the median: {verdict}."])
 
 
+def document(folder: Path) -> str:
+    """The page of all runs kept in `folder`, one JSON file an instruction set."""
+    results = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))]
+    tables = "\n\n".join(table(result) for result in results)
+    return f"""# Latency
+
+From the tracker's answer to the first changed timer register of the emulated board, by stage. `ours` is all but wire
+and firmware; the target is {TARGET_MS:g} ms at the median. `frame`: the tracker client's answer becomes a frame;
+`configuration`: its checks, eq. (1) and the feature window; `ONNX`: the network; `set-points`: limits, eq. (3),
+pressures; `serial`: checks, hand-over to the thread of the port, encoding, writing; `wire`: {CHANNELS} set-points at
+250,000 baud; `firmware`: to the register, with what the emulator adds. Each table is made by
+
+    python tools/bench/latency.py --isa native|avx2 --report docs/latency.md
+
+The loop sleeps between two control steps, and a step that begins with cold caches takes about twice as long. So the
+runtime runs the computation of a step up to three times just before the step is due and discards the results
+(`runtime/warmup.py`). The rows without warm-up show the same code without that.
+
+`avx2` limits numpy. onnxruntime selects its kernels by the processor and has no option to limit them, so the `ONNX`
+column is the same code in both tables.
+
+{tables}
+"""
+
+
 @click.command(help=__doc__)
+@click.option("--isa", type=click.Choice(["native", "avx2"]), default="native", show_default=True,
+              help="Instruction set of numpy.")  # fmt: skip
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all figures here, one JSON object.")
-@click.option("--quick", is_flag=True, help="60 ticks in place of 600 each: less than a minute.")
+@click.option("--report", type=click.Path(path_type=Path), help="Markdown page to update.")
+@click.option("--quick", is_flag=True, help="60 ticks in place of 120 each, with warm-up alone: less than a minute.")
 @click.option("--model", type=click.Path(exists=True, path_type=Path),
               help="Controller of modsoft-export, for any number of modules.  [default: the shipped one]")  # fmt: skip
-def main(json_file: Path | None, quick: bool, model: Path | None) -> None:
-    count = 60 if quick else 600
-    about = {**host(), "load_average": os.getloadavg()[0], "hz": HZ, "target_ms": TARGET_MS}
-    about.pop("name")
+def main(isa: str, json_file: Path | None, report: Path | None, quick: bool, model: Path | None) -> None:
+    if isa == "avx2" and (limits := limited_to_avx2())["NPY_DISABLE_CPU_FEATURES"]:
+        # numpy reads the limit when it is imported
+        raise SystemExit(subprocess.run([sys.executable, *sys.argv], env=os.environ | limits).returncode)
+    count = 60 if quick else 120
     model = model or shipped.model()
-    rows = [figures(modules, count, ticks(modules, count, model)) for modules in MODULES]
-    result = {**about, "rows": rows}
+    described, rows = about(isa), []
+    for modules in MODULES:
+        for warm in (True,) if quick else (True, False):
+            rows.append({**figures(modules, count, ticks(modules, count, model, warm)), "warm": warm})
+    result = {"about": described, "rows": rows}
     click.echo(table(result))
+    text = json.dumps(result, indent=1) + "\n"
     if json_file:
-        json_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        json_file.write_text(text, encoding="utf-8")
+    if report:
+        folder = report.with_suffix("")
+        folder.mkdir(exist_ok=True)
+        (folder / f"{isa}.json").write_text(text, encoding="utf-8")
+        report.write_text(document(folder), encoding="utf-8")
 
 
 if __name__ == "__main__":
