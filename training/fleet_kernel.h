@@ -5,8 +5,8 @@
  * and geometry of element k, B curvature between k - 1 and k, C actuators and stress, D kick. What a stage passes to the
  * next is in a short ring. No lane reads another one, so a robot's numbers do not depend on its place.
  *
- * A and C are in two parts, 1 and 2, with other stages in between: the square roots and divisions of the first part take
- * long, and a processor that cannot look far enough ahead would wait for them.
+ * A, B and C are in two parts, 1 and 2, with other stages in between: the square roots and divisions of the first part
+ * take long, and a processor that cannot look far enough ahead would wait for them.
  *
  * Three short cuts in the algebra, exact but for rounding. With N = stress / stretch + actuator force (material frame):
  * the force between nodes is Q^T N, and the couple of both is rest length * (strain + e3) x N. What transport of the
@@ -36,8 +36,9 @@ struct NAME(work) {
 };
 
 struct NAME(passed) {
-    V d[3], v[3];     /* from A1 to A2: between the nodes, and the sum of their velocities */
-    V pull[ACTUATORS][3], share[ACTUATORS]; /* from C1 to C2: the stretched line of an actuator, and its force over that */
+    V d[3], v[3];    /* from A1 to A2: between the nodes, and the sum of their velocities */
+    V z[3], inverse; /* from B1 to B2: twice the axis of the rotation times its sine; over the mean length */
+    V pull[ACTUATORS][3], share[ACTUATORS]; /* from C1 to C2: an actuator's stretched line; its force over that */
 };
 
 #define ELEMENT struct NAME(element)
@@ -62,9 +63,9 @@ INLINE V NAME(root)(V x)
  * to 0.04 rad a time step. */
 INLINE void NAME(rotate)(V *restrict q, const V *restrict w)
 {
-    V t = DOT(w, w);
-    V s = 1.0 + t * (-1.0 / 6 + t * (1.0 / 120 + t * (-1.0 / 5040)));
-    V c = 0.5 + t * (-1.0 / 24 + t * (1.0 / 720 + t * (-1.0 / 40320)));
+    V t = DOT(w, w), t2 = t * t;
+    V s = (1.0 + t * (-1.0 / 6)) + t2 * (1.0 / 120 + t * (-1.0 / 5040));
+    V c = (0.5 + t * (-1.0 / 24)) + t2 * (1.0 / 720 + t * (-1.0 / 40320));
     V cx = c * w[0], cy = c * w[1], cz = c * w[2];
     V sx = s * w[0], sy = s * w[1], sz = s * w[2];
     V xx = cx * w[0], yy = cy * w[1], zz = cz * w[2];
@@ -120,17 +121,23 @@ INLINE void NAME(strains)(const struct plant *p, double stiffness, ELEMENT *e, W
     }
 }
 
-/* B: curvature between the elements a and b, b's work; asin(x)/x / 4 as a series in 4 x^2 = t. Relative error below 2e-15
- * for 0.3 rad between two elements, 2e-12 for 0.4, 2e-10 for 0.5; a robot that bends more sharply is made non-finite. */
-INLINE void NAME(curvature)(const struct plant *p, double rigidity, const ELEMENT *a, const ELEMENT *b, const WORK *oa,
-                            WORK *o)
+/* B1: rotation from element a to b. */
+INLINE void NAME(bends)(const ELEMENT *a, const ELEMENT *b, const WORK *oa, const WORK *o, PASSED *between)
 {
     const V *f = a->director, *g = b->director;
-    V inverse = 2.0 / (oa->length + o->length);
-    V z[3];
+    V *z = between->z;
+    between->inverse = 2.0 / (oa->length + o->length);
     z[0] = DOT(g + 3, f + 6) - DOT(g + 6, f + 3);
     z[1] = DOT(g + 6, f) - DOT(g, f + 6);
     z[2] = DOT(g, f + 3) - DOT(g + 3, f);
+}
+
+/* B2: curvature before an element; asin(x)/x / 4 as a series in 4 x^2 = t. Relative error below 2e-15 for 0.3 rad
+ * between two elements, 2e-12 for 0.4, 2e-10 for 0.5; a robot that bends more sharply is made non-finite. */
+INLINE void NAME(curvature)(const struct plant *p, double rigidity, const WORK *oa, WORK *o, const PASSED *between)
+{
+    const V *z = between->z;
+    V inverse = between->inverse;
     V t = DOT(z, z), t2 = t * t, t4 = t2 * t2;
 #define C(n, a) ((a) / (4.0 * (1L << 2 * (n))))
     V s0 = (C(0, 1.0) + t * C(1, 1.0 / 6)) + t2 * (C(2, 3.0 / 40) + t * C(3, 5.0 / 112));
@@ -259,8 +266,8 @@ struct NAME(front) {
     int count;
 };
 
-/* All stages, each on its element if `inside` or if the rod has that element. Within a turn A1, A2 and B need this order,
- * and C1 and C2; the rest of the order is for speed. With AVX-512 all of A and B first is a tenth faster. */
+/* All stages, each on its element if `inside` or if the rod has that element. Within a turn A1, A2, B1, B2 need this
+ * order, and C1, C2; the rest of the order is for speed. With AVX-512 all of A and B first is a tenth faster. */
 INLINE void NAME(turn)(const struct NAME(front) *f, int inside, int rubs, int second, int k)
 {
 #define AT(k) (f->ring + ((k) & (RING - 1)))
@@ -275,16 +282,20 @@ INLINE void NAME(turn)(const struct NAME(front) *f, int inside, int rubs, int se
         NAME(lengths)(p, e + k, AT(k), &between);
     if (has_a && early)
         NAME(strains)(p, p->stiffness[k], e + k, AT(k), &between);
-    if (has_b && early)
-        NAME(curvature)(p, p->rigidity[k - 1], e + k - 1, e + k, AT(k - 1), AT(k));
+    if (has_b && early) {
+        NAME(bends)(e + k - 1, e + k, AT(k - 1), AT(k), &between);
+        NAME(curvature)(p, p->rigidity[k - 1], AT(k - 1), AT(k), &between);
+    }
     if (has_c)
         NAME(pulls)(p, second, f->drive, AT(c), AT(c + 1), &between);
     if (has_a && !early)
         NAME(strains)(p, p->stiffness[k], e + k, AT(k), &between);
+    if (has_b && !early)
+        NAME(bends)(e + k - 1, e + k, AT(k - 1), AT(k), &between);
     if (has_d)
         NAME(kick)(p, p->mobility[d], e + d, AT(d - 1), AT(d), AT(d + 1));
     if (has_b && !early)
-        NAME(curvature)(p, p->rigidity[k - 1], e + k - 1, e + k, AT(k - 1), AT(k));
+        NAME(curvature)(p, p->rigidity[k - 1], AT(k - 1), AT(k), &between);
     if (has_c)
         NAME(forces)(p, rubs, second, f->drive, e + c, AT(c - 1), AT(c), &between);
     if (!inside && k == f->count)

@@ -36,7 +36,7 @@ from modsoft.training.robots import PLANTS, Plant
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OPERATIONS_PER_ELEMENT = {"cable": 416, "pneumatic": 434}
+OPERATIONS_PER_ELEMENT = {"cable": 417, "pneumatic": 435}
 ACTIONS = {"cable": 2, "pneumatic": 1}
 BLOCK = 8
 PEAK_ROUNDS = 2_000_000
