@@ -10,6 +10,7 @@ import sys
 import pytest
 
 LIMIT_S = 0.1  # as the rig's own (modsoft.hil.judge): the shortest time-out of the board is 0.3 s
+SLEEPERS: set[int] = set()  # process ids of running checks
 _SLEEPER = """
 import select, sys, time
 worst = 0.0
@@ -33,6 +34,7 @@ class HostLoad:
         self._sleeper = subprocess.Popen(
             [sys.executable, "-c", _SLEEPER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
+        SLEEPERS.add(self._sleeper.pid)
 
     def worst_s(self) -> float:
         assert self._sleeper.stdin is not None
@@ -45,6 +47,7 @@ class HostLoad:
         assert self._sleeper.stdin is not None
         self._sleeper.stdin.close()
         self._sleeper.wait()
+        SLEEPERS.discard(self._sleeper.pid)
 
 
 def judged(report: pytest.TestReport, worst_s: float) -> pytest.TestReport:
