@@ -19,7 +19,7 @@ demo: $(INSTALLED)
 install:
 	tools/install.sh
 
-$(INSTALLED): pyproject.toml setup.py constraints.txt tools/install.sh training/fleet.c training/fleet_kernel.h $(MOVED)
+$(INSTALLED): pyproject.toml setup.py constraints.txt tools/install.sh training/simulation/fleet.c training/simulation/fleet_kernel.h $(MOVED)
 	tools/install.sh
 
 test: $(INSTALLED)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import UsageError
 
 
@@ -45,7 +45,7 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
     if inspect:
         if out is not None or meta is not None:
             raise UsageError("--inspect writes nothing, so it takes no --out and no --meta")
-        from modsoft.export.inspection import print_model
+        from modsoft.export.inspect import print_model
 
         print_model(model)
         return

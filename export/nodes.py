@@ -10,7 +10,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from modsoft.runtime.artefact import IR_VERSION, METADATA_KEY, OPSET
+from modsoft.runtime.control.model_file import IR_VERSION, METADATA_KEY, OPSET
 
 Weights = dict[str, NDArray[np.float32]]
 TORCH_GATES, ONNX_GATES = "ifco", "iofc"  # order of the four gates' rows: input, output, forget, cell

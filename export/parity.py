@@ -16,11 +16,11 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
-from modsoft.export import graph
+from modsoft.export import bilstm_graph
 from modsoft.export.nodes import Weights
-from modsoft.runtime.artefact import FEATURES, FROM_NEIGHBOURS, IR_VERSION, OPSET, Network
-from modsoft.runtime.configuration import labels
-from modsoft.runtime.controller import BoundUnit, Unit, unit_of
+from modsoft.runtime.control.features import labels
+from modsoft.runtime.control.model import BoundUnit, Unit, unit_of
+from modsoft.runtime.control.model_file import FEATURES, FROM_NEIGHBOURS, IR_VERSION, OPSET, Network
 from modsoft.runtime.errors import ModelError
 
 MODULES = (2, 3, 4, 5, 6, 7, 8, 16, 64)  # where the network takes any number
@@ -160,7 +160,7 @@ def check_graph(path: Path) -> None:
 def check_weights(path: Path, weights: Weights, sizes: Network) -> None:
     """Every weight, read back with the gate order undone, is bitwise the checkpoint's."""
     try:
-        found = graph.weights_of(onnx.load(path, load_external_data=False), sizes)
+        found = bilstm_graph.weights_of(onnx.load(path, load_external_data=False), sizes)
     except (KeyError, ValueError) as error:
         raise ModelError(f"the graph lacks weights that the checkpoint has: {error}") from error
     if sorted(found) != sorted(weights):

@@ -8,12 +8,12 @@ from typing import Any
 
 import msgspec
 
-from modsoft.export import graph, parity, source
+from modsoft.export import bilstm_graph, load, parity
 from modsoft.export.nodes import Weights
-from modsoft.runtime import artefact
 from modsoft.runtime import robot as robots
-from modsoft.runtime.artefact import Description, Golden, Network
-from modsoft.runtime.controller import Controller
+from modsoft.runtime.control import model_file
+from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model_file import Description, Golden, Network
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.files import check_not_input, check_writable, written
 from modsoft.training import checkpoint as checkpoints
@@ -41,11 +41,11 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
     check_writable(out)
     if model.suffix == ".onnx":
         raise UsageError(f"{model}: is ONNX already; did you mean modsoft-export --inspect {model}?")
-    check_not_input(out, model, *([] if meta is None else source.files_of(Path(meta))))
+    check_not_input(out, model, *([] if meta is None else load.files_of(Path(meta))))
     if is_default and out.exists() and out != model:
         _check_own(out)
-    checkpoint = source.read(model, None if meta is None else Path(meta))
-    network, sizes = checkpoints.network_of(checkpoint), source.network_of(checkpoint)
+    checkpoint = load.read(model, None if meta is None else Path(meta))
+    network, sizes = checkpoints.network_of(checkpoint), load.network_of(checkpoint)
     expected = parity.reference(network, sizes)
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     described = describe(checkpoint, sizes, weights, expected)
@@ -53,7 +53,7 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
         text = msgspec.json.encode(described).decode()
     except TypeError as error:
         raise ModelError(f"{model}: provenance that is no plain value ({error})") from error
-    content = artefact.sealed(graph.build(weights, sizes, text).SerializeToString())
+    content = model_file.sealed(bilstm_graph.build(weights, sizes, text).SerializeToString())
 
     with written(out) as temporary:
         temporary.write_bytes(content)
@@ -68,7 +68,7 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
 def _check_own(out: Path) -> None:
     """`UsageError` where a file that the user did not name as output is no model of modsoft-export."""
     try:
-        artefact.read(out)
+        model_file.read(out)
     except ModelError as error:
         raise UsageError(f"{out}: exists, and is no model of modsoft-export; give --out {out}, or delete it") from error
 
@@ -77,11 +77,11 @@ def describe(checkpoint: dict[str, Any], sizes: Network, weights: Weights, expec
     """The description of the model to be, its seal not yet set."""
     robot = robots.from_dict(checkpoint["robot"])
     return Description(
-        schema=artefact.SCHEMA,
-        file_sha256=artefact.UNSEALED,
+        schema=model_file.SCHEMA,
+        file_sha256=model_file.UNSEALED,
         weights_sha256=parity.weights_sha256(weights),
-        opset=artefact.OPSET,
-        ir_version=artefact.IR_VERSION,
+        opset=model_file.OPSET,
+        ir_version=model_file.IR_VERSION,
         sequence_axis=sizes.sequence_axis,
         kind=robot.robot.kind,
         state_size=robot.state_size,
@@ -89,7 +89,7 @@ def describe(checkpoint: dict[str, Any], sizes: Network, weights: Weights, expec
         period_s=robot.loop.period_s,
         modules_trained_on=[robot.modules],
         features=list(checkpoint["features"]),
-        label=artefact.LABEL,
+        label=model_file.LABEL,
         network=sizes,
         tolerance=expected.tolerance,
         golden=[

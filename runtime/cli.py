@@ -9,12 +9,12 @@ from typing import Any
 import click
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import RobotFileError, UsageError
 
 
 def _print_ports() -> None:
-    from modsoft.runtime.ports import list_ports  # --help does without pyserial
+    from modsoft.runtime.board.ports import list_ports  # --help does without pyserial
 
     found = list_ports()
     for port in found:
@@ -24,7 +24,7 @@ def _print_ports() -> None:
 
 
 def _check_robot(name: str) -> None:
-    from modsoft.runtime.trajectory import load_task, task_of  # --help does without numpy
+    from modsoft.runtime.control.tasks import load_task, task_of  # --help does without numpy
 
     robot, folder = robots.load(name), robots.folder_of(name)
     task, steps = task_of(robot, folder), 0

@@ -10,25 +10,25 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.actuation import channel_pressures_bar, limited
+from modsoft.runtime.board.protocol import CHANNELS, State, Status
 from modsoft.runtime.clock import SLICE_S, Tick, Ticker
-from modsoft.runtime.configuration import Window, state_of
-from modsoft.runtime.correction import Correction, NoCorrection
+from modsoft.runtime.control.actuation import channel_pressures_bar, limited
+from modsoft.runtime.control.correction import Correction, NoCorrection
+from modsoft.runtime.control.features import Window, state_of
+from modsoft.runtime.control.tasks import ahead
 from modsoft.runtime.errors import LostInRun
-from modsoft.runtime.protocol import CHANNELS, State, Status
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameJudge, Guard, Judgement, check_actuation
+from modsoft.runtime.statistics import Tally
 from modsoft.runtime.stop import Stop
-from modsoft.runtime.tally import Tally
-from modsoft.runtime.tracker import Frame, Slot
-from modsoft.runtime.trajectory import ahead
+from modsoft.runtime.tracking.frame import Frame, Slot
 from modsoft.runtime.warmup import WarmUp
 
 Array = NDArray[np.float64]
 
 
 class Model(Protocol):
-    """What is used of `modsoft.runtime.controller.Controller`."""
+    """What is used of `modsoft.runtime.control.model.Controller`."""
 
     @property
     def history(self) -> int: ...
@@ -36,7 +36,7 @@ class Model(Protocol):
 
 
 class Valves(Protocol):
-    """What is used of `modsoft.runtime.board.Board` between arming and venting."""
+    """What is used of `modsoft.runtime.board.board.Board` between arming and venting."""
 
     @property
     def status(self) -> Status | None: ...

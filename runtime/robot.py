@@ -17,8 +17,8 @@ import msgspec
 from msgspec import Meta
 
 from modsoft.runtime.errors import RobotFileError
-from modsoft.runtime.explain import explain
 from modsoft.runtime.files import read_text
+from modsoft.runtime.validation_messages import explain
 
 
 class Kind(NamedTuple):

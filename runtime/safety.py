@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.configuration import REST_LIMIT_DEG, angle_between_deg, from_poses
+from modsoft.runtime.control.features import REST_LIMIT_DEG, angle_between_deg, from_poses
 from modsoft.runtime.errors import LostInRun, ModelError, ModsoftError, Tripped
 from modsoft.runtime.robot import Robot
-from modsoft.runtime.tracker import Frame
+from modsoft.runtime.tracking.frame import Frame
 
 Array = NDArray[np.float64]
 

@@ -20,14 +20,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime import correction
 from modsoft.runtime import log as logs
 from modsoft.runtime import robot as robots
-from modsoft.runtime.board import Board
+from modsoft.runtime.board.board import Board
+from modsoft.runtime.board.dry_run import Rehearsal
+from modsoft.runtime.board.ports import find_port, ports_here
+from modsoft.runtime.board.protocol import VentMode
 from modsoft.runtime.clock import Ticker, spinning
-from modsoft.runtime.configuration import bending_angle_deg
-from modsoft.runtime.controller import Controller
-from modsoft.runtime.display import StatusLine
+from modsoft.runtime.control import correction
+from modsoft.runtime.control.features import bending_angle_deg
+from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.tasks import load_task, task_of
 from modsoft.runtime.errors import (
     INTERNAL_EXIT_CODE,
     DeviceAbsent,
@@ -40,15 +43,12 @@ from modsoft.runtime.errors import (
 )
 from modsoft.runtime.files import read_text
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.ports import find_port, ports_here
-from modsoft.runtime.protocol import VentMode
-from modsoft.runtime.rehearsal import Rehearsal
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameJudge, check_rest
+from modsoft.runtime.statistics import Tally
+from modsoft.runtime.status_line import StatusLine
 from modsoft.runtime.stop import Keys, Signals, Stop, StopKey
-from modsoft.runtime.tally import Tally
-from modsoft.runtime.tracker import Reader, Slot, open_source, port_of
-from modsoft.runtime.trajectory import load_task, task_of
+from modsoft.runtime.tracking.frame import Reader, Slot, open_source, port_of
 from modsoft.runtime.warmup import WarmUp
 
 Array = NDArray[np.float64]

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime.actuation import channel_pressures_bar, limited
+from modsoft.runtime.board.protocol import CHANNELS
 from modsoft.runtime.clock import SPIN_S
-from modsoft.runtime.configuration import Window, state_of
-from modsoft.runtime.protocol import CHANNELS
+from modsoft.runtime.control.actuation import channel_pressures_bar, limited
+from modsoft.runtime.control.features import Window, state_of
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameJudge, check_actuation
-from modsoft.runtime.tracker import Frame
+from modsoft.runtime.tracking.frame import Frame
 
 Array = NDArray[np.float64]
 

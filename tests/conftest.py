@@ -67,7 +67,7 @@ def make_checkpoint():
         torch = pytest.importorskip("torch")
 
         from modsoft.runtime import robot as robots
-        from modsoft.runtime.configuration import feature_names
+        from modsoft.runtime.control.features import feature_names
         from modsoft.training import checkpoint as checkpoints
         from modsoft.training import networks
 

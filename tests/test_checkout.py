@@ -20,7 +20,8 @@ def run(*command, **options):
 @posix
 def test_make_installs_again_where_the_environment_is_of_another_checkout(tmp_path):
     first, second = tmp_path / "first", tmp_path / NAME
-    prerequisites = ("pyproject.toml", "setup.py", "constraints.txt", "training/fleet.c", "training/fleet_kernel.h")
+    sources = ("training/simulation/fleet.c", "training/simulation/fleet_kernel.h")
+    prerequisites = ("pyproject.toml", "setup.py", "constraints.txt", *sources)
     for name in ("Makefile", *prerequisites):
         (first / name).parent.mkdir(exist_ok=True, parents=True)
         shutil.copy(ROOT / name, first / name)

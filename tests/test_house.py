@@ -25,7 +25,7 @@ def imports(path):
 
 @pytest.mark.parametrize("part", PARTS)
 def test_imports_go_one_way(part):
-    for path in sorted((ROOT / FOLDERS[part]).glob("*.py")):
+    for path in sorted((ROOT / FOLDERS[part]).rglob("*.py")):
         for name in imports(path):
             if name.startswith("modsoft."):
                 other = name.split(".")[1]
@@ -44,4 +44,5 @@ def test_firmware_header_is_generated_from_the_protocol():
 
 def test_init_files_stay_empty():
     for folder in FOLDERS.values():
-        assert (ROOT / folder / "__init__.py").read_text() == ""
+        for path in (ROOT / folder).rglob("__init__.py"):
+            assert path.read_text() == "", path

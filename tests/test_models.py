@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime import trajectory
-from modsoft.runtime.controller import Controller
-from modsoft.training import evaluate, kernel
-from modsoft.training.evaluate import Pilot
-from modsoft.training.fleet import Fleet
+from modsoft.runtime.control import tasks
+from modsoft.runtime.control.model import Controller
+from modsoft.training.simulation import fleet_kernel, rollout
+from modsoft.training.simulation.fleet import Fleet
+from modsoft.training.simulation.rollout import Pilot
 
 pytestmark = pytest.mark.instructions
 
 MODELS = Path(__file__).parents[1] / "tools/models"
-needs_fleet = pytest.mark.skipif(not kernel.variants(), reason="the fleet's kernel is not built here")
+needs_fleet = pytest.mark.skipif(not fleet_kernel.variants(), reason="the fleet's kernel is not built here")
 
 
 @pytest.mark.parametrize(
@@ -40,10 +40,10 @@ def test_a_shipped_model_drives_its_robot(file, robot, task, most):
     far less than that of a model that does not drive."""
     robot = robots.load(robot)
     controller = Controller.load(MODELS / f"{file}.onnx")
-    desired = trajectory.task(task, robot.robot.kind, robot.modules)[:60]
+    desired = tasks.task(task, robot.robot.kind, robot.modules)[:60]
     pilot = Pilot(controller.actuate, controller.history, desired)
-    (flight,) = evaluate.fly(robot, Fleet(robot.robot.kind, robot.modules, 1), [pilot])
-    errors = evaluate.angle_errors_deg if robot.robot.kind == "pneumatic" else evaluate.configuration_errors_percent
+    (flight,) = rollout.fly(robot, Fleet(robot.robot.kind, robot.modules, 1), [pilot])
+    errors = rollout.angle_errors_deg if robot.robot.kind == "pneumatic" else rollout.configuration_errors_percent
     assert errors(flight.configuration, desired).mean(axis=0).max() < most
     still = np.broadcast_to(flight.configuration[:1], (61, robot.modules, 3))
     assert errors(still, desired).mean(axis=0).max() > 2 * most

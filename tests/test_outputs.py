@@ -9,10 +9,10 @@ from modsoft.export import cli as export_cli
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import UsageError
 from modsoft.study import report
-from modsoft.study.folder import Folder
-from modsoft.training import collect_cli, simulate, train_cli
+from modsoft.study.paths import Folder
+from modsoft.training import collect_cli, simulate_cli, train_cli
 
-SIMULATE, COLLECT, TRAIN, EXPORT = simulate.main, collect_cli.main, train_cli.main, export_cli.main
+SIMULATE, COLLECT, TRAIN, EXPORT = simulate_cli.main, collect_cli.main, train_cli.main, export_cli.main
 META = """
 robot = "robot.toml"
 history = 3

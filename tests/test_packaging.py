@@ -41,7 +41,7 @@ def wheel(source, tmp_path_factory):
 def test_without_a_c_compiler_the_wheel_is_built_without_the_kernel(source, tmp_path):
     copy = shutil.copytree(source, tmp_path / "copy", ignore=shutil.ignore_patterns("build", "*.so", "*.egg-info"))
     names = zipfile.ZipFile(build_wheel(copy, tmp_path, CC="false")).namelist()
-    assert "modsoft/training/fleet.py" in names
+    assert "modsoft/training/simulation/fleet.py" in names
     assert not [name for name in names if "_fleet" in name]
 
 
@@ -50,7 +50,8 @@ def test_the_source_distribution_holds_all_that_a_build_needs(source, tmp_path):
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    needed = ("LICENSE", "README.md", "setup.py", "training/fleet.c", "training/fleet_kernel.h", "tools/hil/rig.py")
+    sources = ("training/simulation/fleet.c", "training/simulation/fleet_kernel.h", "tools/hil/rig.py")
+    needed = ("LICENSE", "README.md", "setup.py", *sources)
     robots = [f"runtime/robots/{path.name}" for path in (ROOT / "runtime" / "robots").glob("*.toml")]
     assert len(robots) >= 4
     assert names.issuperset([*needed, *robots])

@@ -36,7 +36,7 @@ def command(name, *arguments):
 def test_posix_is_hidden_from_workers_too(tmp_path):
     (tmp_path / "script.py").write_text(
         "import importlib, os, signal\n"
-        "from modsoft.training import workers\n"
+        "from modsoft.training.data import workers\n"
         "def look(name):\n"
         "    missing = not any((hasattr(os, name), hasattr(signal, name)))\n"
         "    try:\n"
@@ -127,6 +127,6 @@ def opens_text_in_the_systems_encoding(call):
 
 @pytest.mark.parametrize("part", PORTABLE)
 def test_text_files_are_utf_8_on_every_system(part):
-    for path in sorted((ROOT / part).glob("*.py")):
+    for path in sorted((ROOT / part).rglob("*.py")):
         calls = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
         assert [call.lineno for call in calls if opens_text_in_the_systems_encoding(call)] == [], path.name

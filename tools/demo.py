@@ -55,16 +55,17 @@ class Stage:
         return self.makes.with_name(f".{self.makes.name}.made-from")
 
 
-# What the data, the network and the artefact have in common: features, state, and what an action means.
-SHARED = [f"runtime/{name}.py" for name in ("configuration", "actuation", "robot")]
+# What the data, the network and the model file have in common: features, state, and what an action means.
+SHARED = ["runtime/robot.py", "runtime/control/*.py"]
 STAGES = [
     Stage(
         "collect data from the simulated three-module robot",
         ["modsoft-collect", "--robot", ROBOT, "--samples", "15000", "--strategy", "staged", "--out", str(DATA)],
         DATA,
-        [f"runtime/robots/{ROBOT}.toml", "training/fleet*.[ch]", *SHARED]
-        + [f"training/{name}.py" for name in ("robots", "arm", "loads", "fleet", "kernel", "plants", "collect")]
-        + [f"training/{name}.py" for name in ("actions", "dataset", "dataset_checks", "hdf5", "shards", "backends")],
+        [
+            f"runtime/robots/{ROBOT}.toml", "training/simulation/*.[ch]", "training/simulation/*.py",
+            "training/data/*.py", *SHARED,
+        ],
     ),
     Stage(
         "train the biLSTM controller",
@@ -72,16 +73,14 @@ STAGES = [
         ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--iterations", "1000", "--target-percent", "0.7",
          "--minutes", "5"],
         CHECKPOINT,
-        [str(DATA), *SHARED]
-        + [f"training/{name}.py" for name in ("train", "muon", "networks", "checkpoint")]
-        + [f"training/{name}.py" for name in ("dataset", "dataset_checks", "hdf5")],
+        [str(DATA), *SHARED, "training/data/*.py"]
+        + [f"training/{name}.py" for name in ("train", "optimizer", "networks", "checkpoint")],
     ),
     Stage(
         "export it and compare it with torch",
         ["modsoft-export", str(CHECKPOINT), "--out", str(MODEL)],
         MODEL,
-        [str(CHECKPOINT), "export/*.py", "runtime/artefact.py", "runtime/controller.py", *SHARED]
-        + [f"training/{name}.py" for name in ("networks", "checkpoint")],
+        [str(CHECKPOINT), "export/*.py", *SHARED, "training/networks.py", "training/checkpoint.py"],
     ),
 ]
 RUN = [

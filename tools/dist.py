@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 DIST = ROOT / "dist"
-HAS_KERNEL = "import importlib.util as u; print(u.find_spec('modsoft.training._fleet') is not None)"
+HAS_KERNEL = "import importlib.util as u; print(u.find_spec('modsoft.training.simulation._fleet') is not None)"
 ACTIONS = "import numpy; numpy.save('actions.npy', numpy.full((3, 2, 1), 0.2))"  # control steps, modules, sides
 TOOLS = 4  # base and three modules
 

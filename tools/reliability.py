@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import click
 
 from modsoft.runtime import log
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_not_input, read_text, written
 

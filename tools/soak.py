@@ -24,13 +24,13 @@ from pathlib import Path
 import click
 
 from modsoft.hil import shipped
-from modsoft.hil.aftermath import Injected, Ran
-from modsoft.hil.emulator import build, choose
+from modsoft.hil.board.emulator import build, choose
+from modsoft.hil.post_fault_checks import Injected, Ran
 from modsoft.hil.record import board_in_words, firmware_sha256
 from modsoft.hil.soak import Soak, SoakRig
 from modsoft.runtime import log
-from modsoft.runtime.command import entry
-from modsoft.runtime.controller import Controller
+from modsoft.runtime.control.model import Controller
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import LostInRun, UsageError
 from modsoft.runtime.files import written
 

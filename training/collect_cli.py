@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.files import check_not_input, check_writable
 
 
@@ -81,11 +81,11 @@ def cli(
     given = dict(_option(text) for text in options)
     from tqdm import tqdm
 
-    from modsoft.training import plants
-    from modsoft.training.backends import cores
-    from modsoft.training.collect import collect
+    from modsoft.training.data.backends import cores
+    from modsoft.training.data.collect import collect
+    from modsoft.training.simulation import simulators
 
-    chosen = plants.fastest(robot) if plant is None else plants.named(plant, robot)
+    chosen = simulators.fastest(robot) if plant is None else simulators.named(plant, robot)
     if plant is None and chosen.name == "elastica":
         click.echo("the fast plant is not built (no C compiler at installation?): PyElastica, slower", err=True)
     bar: tqdm | None = None
@@ -131,7 +131,7 @@ def plot(data_files: tuple[Path, ...], out: Path) -> None:
     """
     check_writable(out)
     check_not_input(out, *data_files)
-    from modsoft.training import coverage
+    from modsoft.training.data import coverage
 
     found = coverage.compare(list(data_files))
     coverage.draw(found, out)

@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from modsoft.runtime.configuration import feature_names, labels
+from modsoft.runtime.control.features import feature_names, labels
 from modsoft.runtime.errors import ModelError, TargetNotReached, UsageError
 from modsoft.runtime.files import check_writable, target_of
 from modsoft.runtime.locks import locked
 from modsoft.training import checkpoint as checkpoints
-from modsoft.training import muon, networks
-from modsoft.training.dataset import DataSet, Windows, split
+from modsoft.training import networks, optimizer
+from modsoft.training.data.dataset import DataSet, Windows, split
 
 # What suits a kind of robot: history and batch of Table S1. A hanging robot's last modules hang from a module that
 # hardly moves beside them, so that they are as good as a robot of their own; with the cable robot nothing was gained by
@@ -200,7 +200,7 @@ def _train(
     if settings.network != "bilstm":
         described["modules"] = robot["robot"]["modules"]
     network = networks.build(described)
-    identity = {"data_sha256": data_sha256(data), "optimizer": muon.DESCRIPTION, **asdict(settings)}
+    identity = {"data_sha256": data_sha256(data), "optimizer": optimizer.DESCRIPTION, **asdict(settings)}
     resume = out.with_name(f"{out.name}.resume")
     if out.exists():
         made = _finished(out, identity)
@@ -296,7 +296,7 @@ def _fit(
     features, targets = (torch.from_numpy(each).to(device) for each in (training.features, training.targets))
     looked_at = validation.evenly(VALIDATED)
     network.to(device)
-    optimiser = muon.Optimiser(network)
+    optimiser = optimizer.Optimiser(network)
     state: dict[str, Any] = {"identity": identity, "iteration": 0, "elapsed_s": 0.0}
     state |= {"best": None, "best_percent": math.inf, "worse": 0}
     if resume.is_file():

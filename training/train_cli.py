@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import UsageError
 from modsoft.runtime.files import check_not_input, check_writable, target_of
 
@@ -90,7 +90,8 @@ def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from tqdm import tqdm
 
-    from modsoft.training import dataset, train
+    from modsoft.training import train
+    from modsoft.training.data import dataset
 
     data = [dataset.read(path) for path in data_files]
     settings = train.settings_for(data[0].robot.robot.kind, options)

@@ -8,7 +8,7 @@ import torch
 
 from modsoft.export.write import export
 from modsoft.runtime import robot as robots
-from modsoft.runtime.controller import Controller
+from modsoft.runtime.control.model import Controller
 from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.training import networks
 

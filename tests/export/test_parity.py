@@ -6,9 +6,9 @@ import pytest
 import torch
 from onnx import helper, numpy_helper
 
-from modsoft.export import graph, parity, source, write
+from modsoft.export import bilstm_graph, load, parity, write
 from modsoft.export.write import export
-from modsoft.runtime.controller import unit_of
+from modsoft.runtime.control.model import unit_of
 from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
 
@@ -152,7 +152,7 @@ CHECKS = {
 def loaded(checkpoint):
     """The network in a checkpoint, and its sizes."""
     stored = checkpoints.load(checkpoint)
-    return checkpoints.network_of(stored), source.network_of(stored)
+    return checkpoints.network_of(stored), load.network_of(stored)
 
 
 @pytest.fixture(scope="module")
@@ -200,14 +200,14 @@ def test_every_fault_is_some_checks():
 @pytest.mark.parametrize("fault", FAULTS)
 def test_export_refuses_and_leaves_nothing(fault, sound, tmp_path, monkeypatch):
     checkpoint, *_ = sound
-    build = graph.build
+    build = bilstm_graph.build
 
     def spoilt(*arguments):
         model = build(*arguments)
         FAULTS[fault](model)
         return model
 
-    monkeypatch.setattr(write.graph, "build", spoilt)
+    monkeypatch.setattr(write.bilstm_graph, "build", spoilt)
     with pytest.raises(ModelError, match="not written"):
         export(checkpoint, tmp_path / "model.onnx")
     assert list(tmp_path.iterdir()) == []
@@ -238,7 +238,7 @@ def test_a_network_that_ignores_its_neighbours_is_refused(sound, tmp_path, make_
                 weight[weight.shape[0] // 4 : weight.shape[0] // 2] = -100.0
     expected = parity.reference(network, sizes)
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    unit = unit_of(graph.build(weights, sizes, "{}").SerializeToString())
+    unit = unit_of(bilstm_graph.build(weights, sizes, "{}").SerializeToString())
     parity.check_fused(unit, expected)
     with pytest.raises(ModelError, match="no difference"):
         parity.check_chain(unit, expected)

@@ -10,7 +10,7 @@ import torch
 
 from modsoft.export import cli, write
 from modsoft.export.write import export
-from modsoft.runtime.controller import Controller
+from modsoft.runtime.control.model import Controller
 from modsoft.runtime.errors import ModelError, OutputError, UsageError
 from modsoft.training import checkpoint as checkpoints
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from modsoft.runtime import protocol
+from modsoft.runtime.board import protocol
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = "MODSOFT_NATIVE_FIRMWARE"

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modsoft.runtime import protocol, robot
-from modsoft.runtime.board import DOWN_BAR, Board
+from modsoft.runtime import robot
+from modsoft.runtime.board import protocol
+from modsoft.runtime.board.board import DOWN_BAR, Board
+from modsoft.runtime.board.protocol import Fault, State, VentMode
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, RobotFileError, Tripped
-from modsoft.runtime.protocol import Fault, State, VentMode
 
 ROOT = Path(__file__).resolve().parents[2]
 BOOT_MS = 840  # the bootloader's window after a reset, as measured on the emulated MEGA
@@ -248,7 +249,7 @@ def test_fault_that_has_a_cause_is_not_cleared_at_arming(new_board):
 
 def test_foreign_protocol_is_refused(new_board, monkeypatch):
     port = VirtualPort(new_board)
-    monkeypatch.setattr("modsoft.runtime.link.PROTOCOL_HASH", 0x1234)
+    monkeypatch.setattr("modsoft.runtime.board.connection.PROTOCOL_HASH", 0x1234)
     with pytest.raises(ProtocolMismatch, match="flash the firmware of this version"):
         connect(port)
     assert port.written == []

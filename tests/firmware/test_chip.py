@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from modsoft.runtime.protocol import CHANNELS, NOT_MEASURED, ResetCause
+from modsoft.runtime.board.protocol import CHANNELS, NOT_MEASURED, ResetCause
 
 FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
 TIMERS = {1: 0x80, 3: 0x90, 4: 0xA0, 5: 0x120}  # TCCRnA; TCCRnB, TCNTn, ICRn and OCRnA to C follow

@@ -7,8 +7,8 @@ import zlib
 
 import pytest
 
-from modsoft.runtime import cobs, protocol
-from modsoft.runtime.protocol import ClearFault, Fault, Hello, HelloReq, NackReason, State, Status, Vent, VentMode
+from modsoft.runtime.board import cobs, protocol
+from modsoft.runtime.board.protocol import ClearFault, Fault, Hello, HelloReq, NackReason, State, Status, Vent, VentMode
 
 FULL = (3500,) * 6
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modsoft.runtime import cobs, protocol
+from modsoft.runtime.board import cobs, protocol
 
 
 @pytest.mark.parametrize("kind", ["flip", "drop", "insert", "truncate", "garbage", "repeat"])

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from modsoft.hil import emulator
-from modsoft.hil.emulator import EmulatedBoard
+from modsoft.hil.board import emulator
+from modsoft.hil.board.emulator import EmulatedBoard
 
 HERE = Path(__file__).parent
 DRIVER = HERE / "drive_board.py"

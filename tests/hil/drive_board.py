@@ -5,7 +5,7 @@ pressures (one for each channel from 0 on, the others 0) ten times a second for 
 a line: {"hello": ..., "after_s": ...} and then {"status": ...} for every STATUS.
 With no pressures it only listens; with `--heartbeats N` it sends N frames as fast as the line takes them, once.
 
-It speaks the wire by `modsoft.runtime.protocol` alone, so that the board is judged without the runtime's host side.
+It uses `modsoft.runtime.board.protocol` alone, so that the board is judged without the runtime's host side.
 """
 
 import json
@@ -14,7 +14,7 @@ import time
 
 import serial
 
-from modsoft.runtime.protocol import PROTOCOL_HASH, Arm, Heartbeat, Hello, Parser, Set, Status, encode, to_units
+from modsoft.runtime.board.protocol import PROTOCOL_HASH, Arm, Heartbeat, Hello, Parser, Set, Status, encode, to_units
 
 BAUD = 250_000
 PERIOD_S = 0.1

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from modsoft.training import kernel
+from modsoft.training.simulation import fleet_kernel
 
 BENCH = Path(__file__).parents[2] / "tools/bench/models.py"
 
 
-@pytest.mark.skipif(not kernel.variants(), reason="the fleet's kernel is not built here")
+@pytest.mark.skipif(not fleet_kernel.variants(), reason="the fleet's kernel is not built here")
 def test_it_tells_every_model_task_and_correction(tmp_path):
     out = tmp_path / "models.json"
     told = subprocess.run(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modsoft.runtime.configuration import bending_angle_deg, from_poses
+from modsoft.runtime.control.features import bending_angle_deg, from_poses
 
 BENCH = Path(__file__).parents[2] / "tools" / "bench"
 

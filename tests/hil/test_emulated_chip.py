@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from modsoft.hil.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
 
 BAUD = 250_000  # of the echo; and of the firmware
 pytestmark = pytest.mark.realtime

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from modsoft.hil.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.hil.trace import vented_us
 
 pytestmark = pytest.mark.realtime

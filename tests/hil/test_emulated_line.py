@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import serial
 
-from modsoft.hil.emulator import EmulatedBoard, is_event
-from modsoft.runtime.protocol import PROTOCOL_HASH, Hello, HelloReq, Parser, ResetCause, encode
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.runtime.board.protocol import PROTOCOL_HASH, Hello, HelloReq, Parser, ResetCause, encode
 
 BAUD = 250_000
 HELLO_TIMEOUT_S = 5.0

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from modsoft.hil import emulator
-from modsoft.hil.emulator import EmulatedBoard, is_event
+from modsoft.hil.board import emulator
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.runtime.errors import DeviceAbsent
 
 
@@ -28,7 +28,7 @@ def test_a_checkout_of_another_user_is_built_elsewhere() -> None:
     code = (
         "from modsoft.runtime import process\n"
         "process.is_writable = lambda folder: False\n"
-        "from modsoft.hil import emulator\n"
+        "from modsoft.hil.board import emulator\n"
         "print(emulator.build('native'), emulator.FIRMWARE_ELF)\n"
     )
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
@@ -72,7 +72,7 @@ def test_a_file_in_the_place_of_the_port_is_kept(board_name: str, tmp_path: Path
 
 def test_board_ends_with_its_starter(board_name: str) -> None:
     script = (
-        "from modsoft.hil.emulator import EmulatedBoard; import sys, time\n"
+        "from modsoft.hil.board.emulator import EmulatedBoard; import sys, time\n"
         f"board = EmulatedBoard({board_name!r}).start(); print(board.pid, board.port, flush=True); time.sleep(60)"
     )
     starter = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)

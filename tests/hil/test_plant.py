@@ -8,8 +8,8 @@ import pytest
 
 from modsoft.hil.plant import Plant, duties_from, run, set_points_bar, tool_poses
 from modsoft.runtime import robot as robots
-from modsoft.runtime.actuation import channel_pressures_bar, pressures_bar
-from modsoft.runtime.configuration import from_directors, from_poses
+from modsoft.runtime.control.actuation import channel_pressures_bar, pressures_bar
+from modsoft.runtime.control.features import from_directors, from_poses
 
 
 class StandIn:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from modsoft.hil.polaris import Line, write_tool_files
 from modsoft.hil.polaris_device import Polaris, crc16, quaternion
 from modsoft.runtime.errors import DeviceAbsent, UsageError
-from modsoft.runtime.ndi import NDI
+from modsoft.runtime.tracking.ndi import NDI
 
 
 def framed(command: str) -> bytes:

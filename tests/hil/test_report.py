@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from modsoft.hil import report
-from modsoft.hil.judge import judge
+from modsoft.hil.criteria import judge
 from modsoft.hil.record import Record, Valves
 from modsoft.runtime import robot as robots
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.control.features import from_angles_deg
 
 
 @pytest.fixture

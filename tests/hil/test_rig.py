@@ -16,13 +16,14 @@ import numpy as np
 import pytest
 from processes import descendants
 
-from modsoft.hil import emulator, judge, record
+from modsoft.hil import criteria, record
+from modsoft.hil.board import emulator
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child, Rig
 from modsoft.runtime import log
 from modsoft.runtime import robot as robots
-from modsoft.runtime.configuration import angle_between_deg
-from modsoft.runtime.trajectory import load_task
+from modsoft.runtime.control.features import angle_between_deg
+from modsoft.runtime.control.tasks import load_task
 
 SCRIPTS = Path(sys.executable).parent
 
@@ -64,7 +65,7 @@ def run(folder, robot, model, steps):
 
 def as_in_collection(found, run_folder):
     """Configurations at the ticks (K, N, 3) of the robot that training data comes from, given what the run applied."""
-    from modsoft.training.arm import Arm
+    from modsoft.training.simulation.elastica import Arm
 
     arm = Arm(found.robot.robot.kind, found.robot.modules)
     arm.step(np.zeros((found.robot.modules, 1)))  # the period before the first tick
@@ -79,7 +80,7 @@ def as_in_collection(found, run_folder):
 @pytest.mark.parametrize("robot", ["pneumatic-3", "pneumatic-2"])
 def test_a_model_of_three_modules_runs_robots_of_three_and_two(robot, strong_model, tmp_path):
     found = run(tmp_path, robot, strong_model, steps=20)
-    verdict = judge.judge(found)
+    verdict = criteria.judge(found)
     table = "\n".join(f"{line.ok}  {line.name}: {line.found} ({line.limit})" for line in verdict.acceptances)
     print(table)
     assert verdict.word == "not judged", table

@@ -12,8 +12,8 @@ import pytest
 from flawless import COUNTS, flawless_run, slewed, told
 
 from modsoft.hil import soak as soaks
-from modsoft.hil.aftermath import Injected, Ran, judge_fault, judge_log, judge_valves, judge_vent
 from modsoft.hil.faults import FAULTS, Log
+from modsoft.hil.post_fault_checks import Injected, Ran, judge_fault, judge_log, judge_valves, judge_vent
 from modsoft.runtime import log as logs
 
 TOOL = Path(__file__).parents[2] / "tools" / "soak.py"

@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from modsoft.hil.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.hil.stepped import SteppedPort
-from modsoft.runtime.board import Board
+from modsoft.runtime.board.board import Board
 
 
 def hello_at_s(port: SteppedPort) -> float:

@@ -3,13 +3,12 @@
 import pytest
 from mega_in_run import stepped_host
 
-from modsoft.hil.emulator import EmulatedBoard, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard, missing_packages
 from modsoft.hil.stepped import SteppedPort
 from modsoft.hil.trace import rises
-from modsoft.runtime import link
 from modsoft.runtime import robot as robots
-from modsoft.runtime.errors import ProtocolMismatch
-from modsoft.runtime.protocol import (
+from modsoft.runtime.board import connection
+from modsoft.runtime.board.protocol import (
     PROTOCOL_HASH,
     Arm,
     Heartbeat,
@@ -22,6 +21,7 @@ from modsoft.runtime.protocol import (
     Status,
     encode,
 )
+from modsoft.runtime.errors import ProtocolMismatch
 
 missing = missing_packages("simavr")
 pytestmark = pytest.mark.skipif(bool(missing), reason=f"simavr needs {' '.join(missing)}")
@@ -108,7 +108,7 @@ def test_row_23_channels_or_protocol_hash_differ(matrix_row, monkeypatch):
         foreign = range(0, 32, 4)
         for bit in foreign:
             emulated.run(1000, 0)  # so that it sees the port closed
-            monkeypatch.setattr(link, "PROTOCOL_HASH", PROTOCOL_HASH ^ 1 << bit)
+            monkeypatch.setattr(connection, "PROTOCOL_HASH", PROTOCOL_HASH ^ 1 << bit)
             with pytest.raises(ProtocolMismatch, match="flash the firmware of this version"):
                 stepped_host(emulated)
         assert rises(emulated.trace) == 0

@@ -14,10 +14,9 @@ import mega_in_run
 import pytest
 from mega_in_run import Host, in_stepped_run, inject, side_by_side
 
-from modsoft.hil.emulator import EmulatedBoard, is_event, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard, is_event, missing_packages
 from modsoft.hil.trace import rises, vented_us
-from modsoft.runtime.errors import LostInRun, Tripped
-from modsoft.runtime.protocol import (
+from modsoft.runtime.board.protocol import (
     CHANNELS,
     PROTOCOL_HASH,
     Fault,
@@ -31,6 +30,7 @@ from modsoft.runtime.protocol import (
     encode,
     to_units,
 )
+from modsoft.runtime.errors import LostInRun, Tripped
 
 missing = missing_packages("simavr")
 pytestmark = [

@@ -14,9 +14,9 @@ from mega_in_run import side_by_side
 from runtime_in_run import Run, Stand
 
 from modsoft.hil import record
+from modsoft.runtime.board.protocol import Fault
+from modsoft.runtime.control.tasks import REAL_STEPS
 from modsoft.runtime.errors import LostInRun, Tripped
-from modsoft.runtime.protocol import Fault
-from modsoft.runtime.trajectory import REAL_STEPS
 
 pytestmark = pytest.mark.realtime
 

@@ -13,7 +13,7 @@ from runtime_in_run import SCRIPT, Run, Stand, if_begun
 from spoilt_models import damaged, redescribed, running_wild
 from virtual_loop import World
 
-from modsoft.hil.emulator import EmulatedBoard
+from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.runtime import session
 from modsoft.runtime.errors import ModelError
 

@@ -12,13 +12,13 @@ import pytest
 from mega_in_run import Host, in_stepped_run, inject, side_by_side, stepped_host
 from runtime_in_run import Run, Stand
 
-from modsoft.hil.emulator import EmulatedBoard, is_event, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard, is_event, missing_packages
 from modsoft.hil.stepped import SteppedPort
 from modsoft.hil.trace import rises
-from modsoft.runtime import link, ports
-from modsoft.runtime.board import Board
+from modsoft.runtime.board import connection, ports
+from modsoft.runtime.board.board import Board
+from modsoft.runtime.board.protocol import PROTOCOL_HASH, State
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, PortBusy, ProtocolMismatch
-from modsoft.runtime.protocol import PROTOCOL_HASH, State
 
 missing = missing_packages("simavr")
 pytestmark = pytest.mark.skipif(bool(missing), reason=f"simavr needs {' '.join(missing)}")
@@ -228,7 +228,7 @@ def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypat
         refused("at the wrong rate", emulated.port, DeviceAbsent, 69, baud=115200)
         closed(emulated, 2)
         with monkeypatch.context() as another:
-            another.setattr(link, "PROTOCOL_HASH", PROTOCOL_HASH ^ 1)
+            another.setattr(connection, "PROTOCOL_HASH", PROTOCOL_HASH ^ 1)
             refused("of another version", emulated.port, ProtocolMismatch, 76)
     opened = sum(event["event"] == "uart-open" for event in emulated.trace)
     assert opened == 3, "busy, at the wrong rate, of another version: each once"
@@ -251,7 +251,7 @@ def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypat
 
 def given_up_when_mute():
     """Seconds after which a port without a byte is given up, and how many resets were tried before."""
-    silent, hundredths = link.Link(0.0), 0
+    silent, hundredths = connection.Link(0.0), 0
     while not silent.gave_up:
         hundredths += 1
         assert silent.poll(hundredths / 100) == b""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stepped_run import SteppedRun
 
-from modsoft.hil.emulator import EmulatedBoard, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard, missing_packages
 from modsoft.hil.trace import rises, vented_us
 from modsoft.runtime.errors import INTERNAL_EXIT_CODE
 

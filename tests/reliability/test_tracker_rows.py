@@ -9,10 +9,10 @@ from virtual_loop import PERIOD_S, ROBOT, World, planar_poses, spoils
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime import safety
-from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.errors import LostInRun, Tripped
 from modsoft.runtime.safety import FrameJudge
-from modsoft.runtime.tracker import Frame, Slot
+from modsoft.runtime.tracking.frame import Frame, Slot
 
 VENT_LIMIT_S = 3 * PERIOD_S + 0.05  # from the last good frame on
 RUN_S = 8 * PERIOD_S  # of a run before its fault

@@ -10,8 +10,8 @@ from mega_in_run import in_stepped_run, inject, side_by_side
 from runtime_in_run import FAULTY, SCRIPT, Run, Stand, if_begun
 
 from modsoft.hil.trace import rises, vented_us
+from modsoft.runtime.board.protocol import Fault, State
 from modsoft.runtime.errors import LostInRun, Tripped
-from modsoft.runtime.protocol import Fault, State
 
 pytestmark = pytest.mark.realtime
 

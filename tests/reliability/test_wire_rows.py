@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from storm_on_mega import Storm
 
-from modsoft.hil import emulator
-from modsoft.runtime.protocol import State
+from modsoft.hil.board import emulator
+from modsoft.runtime.board.protocol import State
 
 ROOT = Path(__file__).resolve().parents[2]
 TEN_TO_THE_8 = 100_000_000

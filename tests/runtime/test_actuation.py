@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from modsoft.runtime import actuation, robot
+from modsoft.runtime import robot
+from modsoft.runtime.control import actuation
 
 ROBOT = robot.load("pneumatic-3")
 ACTIONS = arrays(np.float64, (3, 1), elements=st.floats(-1, 1))

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot
-from modsoft.runtime.board import Board
-from modsoft.runtime.protocol import ResetCause, VentMode
+from modsoft.runtime.board.board import Board
+from modsoft.runtime.board.protocol import ResetCause, VentMode
 
 pytest.importorskip("fcntl", reason="the rig needs Linux")
-from modsoft.hil.emulator import EmulatedBoard, choose, is_event, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard, choose, is_event, missing_packages
 
 pytestmark = pytest.mark.realtime
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from modsoft.runtime.correction import IntegralCorrection, NoCorrection, named
+from modsoft.runtime.control.correction import IntegralCorrection, NoCorrection, named
+from modsoft.runtime.control.tasks import ahead, task
 from modsoft.runtime.errors import UsageError
-from modsoft.runtime.trajectory import ahead, task
 
 
 def unit(vectors):

@@ -7,8 +7,10 @@ from hypothesis import strategies as st
 from virtual_loop import PERIOD_S, ROBOT, World
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.actuation import channel_pressures_bar
-from modsoft.runtime.configuration import (
+from modsoft.runtime.board.dry_run import Rehearsal
+from modsoft.runtime.board.protocol import CHANNELS
+from modsoft.runtime.control.actuation import channel_pressures_bar
+from modsoft.runtime.control.features import (
     Window,
     bending_angle_deg,
     episode_features,
@@ -18,10 +20,8 @@ from modsoft.runtime.configuration import (
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
 from modsoft.runtime.log import plain
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.protocol import CHANNELS
-from modsoft.runtime.rehearsal import Rehearsal
+from modsoft.runtime.statistics import Tally
 from modsoft.runtime.stop import Interrupted, StopKey
-from modsoft.runtime.tally import Tally
 
 REST = np.array([[0.0, 0.0, 1.0]] * 3)
 

@@ -17,7 +17,7 @@ SCRIPTS = Path(sys.executable).parent
 COMMAND = """
 import os, subprocess, sys
 import click
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 
 @click.command("command")
 def cli():
@@ -48,7 +48,7 @@ def test_workers_import_nothing_from_the_current_folder(tmp_path):
     """Those of a Python program, too, which is no command."""
     (tmp_path / "signal.py").write_text("raise SystemExit('a script of the user')")
     code = (
-        "from modsoft.training import workers\n"
+        "from modsoft.training.data import workers\n"
         "if __name__ == '__main__':\n"
         "    print(sorted(workers.run(print, [1, 2], 2)))\n"
     )
@@ -61,7 +61,7 @@ def test_another_clone_is_refused(how, tmp_path):
     """Seen from above, a clone called modsoft adds its modules to the installed ones."""
     for part in ("runtime", "training", "export"):
         (tmp_path / "modsoft" / part).mkdir(parents=True)
-        for source in (ROOT / part).glob("*.py"):
+        for source in (ROOT / part).rglob("*.py"):
             (tmp_path / "modsoft" / part / source.name).write_bytes(source.read_bytes())
     environment = {**os.environ, "PYTHONPATH": str(tmp_path) if how == "PYTHONPATH" else ""}
     environment.pop("PYTHONSAFEPATH", None)
@@ -179,4 +179,4 @@ def test_onnxruntime_is_imported_in_one_place():
         for path in sorted((ROOT / folder).rglob("*.py"))
         if re.search(r"^\s*(import|from) onnxruntime", path.read_text(encoding="utf-8"), re.MULTILINE)
     ]
-    assert importers == ["runtime/ort.py"]
+    assert importers == ["runtime/control/ort.py"]

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modsoft.runtime import cobs, protocol
+from modsoft.runtime.board import cobs, protocol
 
 ROOT = Path(__file__).resolve().parents[2]
 RANGES = {"uint8_t": (0, 0xFF), "uint16_t": (0, 0xFFFF), "uint32_t": (0, 0xFFFFFFFF), "int16_t": (-0x8000, 0x7FFF)}

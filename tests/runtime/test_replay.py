@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from modsoft.runtime.errors import DeviceAbsent
-from modsoft.runtime.replay import Replay, recorded
+from modsoft.runtime.tracking.replay import Replay, recorded
 
 TOOLS = 3
 POSES = np.tile(np.eye(4), (TOOLS, 1, 1)).tolist()

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
 from modsoft.runtime import safety
-from modsoft.runtime.configuration import bending_angle_deg
+from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
 from modsoft.runtime.safety import FrameJudge, Guard, Judgement, check_actuation, check_rest
-from modsoft.runtime.tracker import Frame
+from modsoft.runtime.tracking.frame import Frame
 
 
 def frame(number, at_s, angles=(0.0, 0.0, 0.0), **changes):

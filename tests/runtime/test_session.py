@@ -6,13 +6,13 @@ import pytest
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime import session
+from modsoft.runtime.board.protocol import VentMode
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped, UsageError
 from modsoft.runtime.log import RunLog
-from modsoft.runtime.protocol import VentMode
 from modsoft.runtime.safety import FrameJudge
+from modsoft.runtime.statistics import Tally
 from modsoft.runtime.stop import Interrupted, Stop, StopKey
-from modsoft.runtime.tally import Tally
-from modsoft.runtime.tracker import Slot
+from modsoft.runtime.tracking.frame import Slot
 
 ROBOT = robots.load("pneumatic-3")
 

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from modsoft.runtime.display import StatusLine
 from modsoft.runtime.errors import Tripped
+from modsoft.runtime.status_line import StatusLine
 from modsoft.runtime.stop import SIGNALS, Interrupted, Keys, Signals, Stop, StopKey
 
 CODES = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129}

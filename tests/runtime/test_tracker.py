@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modsoft.runtime import ndi
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import DeviceAbsent, UsageError
-from modsoft.runtime.replay import Replay
-from modsoft.runtime.tracker import Frame, Reader, Slot, open_source
+from modsoft.runtime.tracking import ndi
+from modsoft.runtime.tracking.frame import Frame, Reader, Slot, open_source
+from modsoft.runtime.tracking.replay import Replay
 
 ROBOT = robots.load("pneumatic-3")
 

@@ -9,7 +9,7 @@ from virtual_loop import PERIOD_S, ROBOT, World, spoils
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.clock import SPIN_S
-from modsoft.runtime.configuration import Window
+from modsoft.runtime.control.features import Window
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.log import plain
 from modsoft.runtime.warmup import LEAD, MARGIN, RUNS, WarmUp

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.control.tasks import load_task
 from modsoft.runtime.errors import UsageError
-from modsoft.runtime.trajectory import load_task
-from modsoft.training import collect_cli, dataset, simulate, train_cli
+from modsoft.training import collect_cli, simulate_cli, train_cli
+from modsoft.training.data import dataset
 
 
 @pytest.fixture
@@ -119,7 +120,7 @@ def test_headers_that_claim_too_much(tmp_path, content, ended):
     """As actions, and as the task of the real loop, where a wrong file is a wrong order: 2."""
     path = tmp_path / "a.npy"
     path.write_bytes(content)
-    code, said = ended(simulate.main, "--robot", "pneumatic-2", "--actions", path, "--out", tmp_path / "o")
+    code, said = ended(simulate_cli.main, "--robot", "pneumatic-2", "--actions", path, "--out", tmp_path / "o")
     assert (code, len(said)) == (65, 1)
     with pytest.raises(UsageError, match=r"^task file [^\n]*: not a readable .npy array"):
         load_task(str(path), robots.load("pneumatic-2"))
@@ -128,7 +129,7 @@ def test_headers_that_claim_too_much(tmp_path, content, ended):
 def test_actions_that_are_a_pickle_end_modsoft_simulate_with_65(tmp_path, mark, evil, ended):
     np.save(tmp_path / "a.npy", np.array([[[evil]]]), allow_pickle=True)
     order = ["--robot", "pneumatic-2", "--actions", tmp_path / "a.npy", "--out", tmp_path / "o"]
-    code, said = ended(simulate.main, *order)
+    code, said = ended(simulate_cli.main, *order)
     assert (code, len(said)) == (65, 1)
     assert not mark.exists()
 

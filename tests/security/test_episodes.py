@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import InUse, OutputError
-from modsoft.training import collect, dataset
-from modsoft.training.plants import Plant
-from modsoft.training.shards import Shards
+from modsoft.training.data import collect, dataset
+from modsoft.training.data.episode_store import Shards
+from modsoft.training.simulation.simulators import Plant
 
 ROBOT = robots.load("pneumatic-2")
 

@@ -9,12 +9,12 @@ from onnx import TensorProto, helper
 from spoilt_models import onnx_description, sealed_at
 
 from modsoft.export import cli as export_cli
-from modsoft.export import inspection
+from modsoft.export import inspect
 from modsoft.hil import cli as hil_cli
-from modsoft.runtime import artefact
 from modsoft.runtime import cli as runtime_cli
-from modsoft.runtime.controller import Controller
-from modsoft.runtime.ort import onnxruntime
+from modsoft.runtime.control import model_file as model_files
+from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.ort import onnxruntime
 
 
 def largest_weight(model):
@@ -88,7 +88,7 @@ def test_what_a_model_says_does_not_command_the_terminal(tmp_path, model_file, c
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
     said = {**onnx_description(model), "provenance": {f"seed{clear}": f"1{clear}"}}
     sealed_at(path, model, said)
-    inspection.print_model(path)
+    inspect.print_model(path)
     out = capfd.readouterr().out
     assert "seed\\x1b[2J: 1\\x1b[2J" in out
     assert "\x1b" not in out
@@ -99,7 +99,7 @@ def test_what_a_model_says_does_not_command_the_terminal(tmp_path, model_file, c
     [
         (b'"provenance":{', b'"provenance":{"x":' + b"[" * 100_000 + b"]" * 100_000 + b","),
         (b'"provenance":{"', b'"provenance":{"\xff'),
-        (artefact.ACTUATION.encode(), b"actuatio\xff"),
+        (model_files.ACTUATION.encode(), b"actuatio\xff"),
     ],
     ids=["deep", "not a text", "no name"],
 )
@@ -113,8 +113,8 @@ def test_a_description_that_breaks_its_reader(tmp_path, model_file, refused, bef
         (entry,) = model.metadata_props
         entry.value = entry.value.replace(before.decode(), before.decode() + mark)
         content = model.SerializeToString().replace(before + mark.encode(), after)
-    seal = artefact._SEAL.search(content)[1]
-    (tmp_path / "model.onnx").write_bytes(artefact.sealed(content.replace(seal, artefact.UNSEALED.encode())))
+    seal = model_files._SEAL.search(content)[1]
+    (tmp_path / "model.onnx").write_bytes(model_files.sealed(content.replace(seal, model_files.UNSEALED.encode())))
     refused(Controller.load, tmp_path / "model.onnx", "UTF-8|description cannot be read|refuses it")
 
 
@@ -137,6 +137,6 @@ def test_a_model_in_the_other_format_of_onnxruntime(tmp_path, model_file, refuse
     onnxruntime.InferenceSession(model_file, options)
     content = path.read_bytes()
     onnxruntime.InferenceSession(content)  # whoever does not say which format takes both
-    seal = artefact._SEAL.search(content)[1]
-    path.write_bytes(artefact.sealed(content.replace(seal, artefact.UNSEALED.encode())))
+    seal = model_files._SEAL.search(content)[1]
+    path.write_bytes(model_files.sealed(content.replace(seal, model_files.UNSEALED.encode())))
     refused(Controller.load, path, "onnxruntime .* refuses it")

@@ -70,7 +70,7 @@ def test_a_run_on_the_rig_listens_for_this_machine_alone(tracker, ports, tmp_pat
 DASK = """
 import json, sys
 from pathlib import Path
-from modsoft.training import backends
+from modsoft.training.data import backends
 
 if __name__ == "__main__":
     with backends.by_dask(1, Path("."), json.loads(sys.argv[1])):

@@ -4,8 +4,8 @@ import numpy as np
 
 from modsoft.hil.record import Record, Valves
 from modsoft.runtime import robot as robots
-from modsoft.runtime.actuation import channel_pressures_bar
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.control.actuation import channel_pressures_bar
+from modsoft.runtime.control.features import from_angles_deg
 
 TICKS = 120
 PERIOD_NS = 400_000_000

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-LIMIT_S = 0.1  # as the rig's own (modsoft.hil.judge): the shortest time-out of the board is 0.3 s
+LIMIT_S = 0.1  # as the rig's own (modsoft.hil.criteria): the shortest time-out of the board is 0.3 s
 SLEEPERS: set[int] = set()  # process ids of running checks
 _SLEEPER = """
 import select, sys, time

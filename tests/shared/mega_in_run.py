@@ -12,12 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from modsoft.hil.emulator import EmulatedBoard
+from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.hil.stepped import SteppedPort
 from modsoft.runtime import robot as robots
-from modsoft.runtime.board import Board
-from modsoft.runtime.ports import open_port
-from modsoft.runtime.protocol import State
+from modsoft.runtime.board.board import Board
+from modsoft.runtime.board.ports import open_port
+from modsoft.runtime.board.protocol import State
 
 CHECK_S = 0.005  # how often the real loop looks between two ticks
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from virtual_loop import planar_poses
 
-from modsoft.hil.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child
 from modsoft.runtime import log as logs

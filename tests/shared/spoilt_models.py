@@ -4,7 +4,7 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from modsoft.runtime import artefact
+from modsoft.runtime.control import model_file as model_files
 
 
 def damaged(sound, generator):
@@ -28,7 +28,7 @@ def damaged(sound, generator):
 
 
 def onnx_description(model):
-    return artefact.msgspec.json.decode(model.metadata_props[0].value)
+    return model_files.msgspec.json.decode(model.metadata_props[0].value)
 
 
 def redescribed(model_file, path, change):
@@ -40,10 +40,10 @@ def redescribed(model_file, path, change):
 
 def sealed_at(path, model, table):
     """Writes a model with this description, soundly sealed; returns `path`."""
-    table["file_sha256"] = artefact.UNSEALED
+    table["file_sha256"] = model_files.UNSEALED
     del model.metadata_props[:]
-    helper.set_model_props(model, {artefact.METADATA_KEY: artefact.msgspec.json.encode(table).decode()})
-    path.write_bytes(artefact.sealed(model.SerializeToString()))
+    helper.set_model_props(model, {model_files.METADATA_KEY: model_files.msgspec.json.encode(table).decode()})
+    path.write_bytes(model_files.sealed(model.SerializeToString()))
     return path
 
 
@@ -54,19 +54,19 @@ def running_wild(model_file, path, value, beyond):
     graph = model.graph
     for node in graph.node:
         for index, name in enumerate(node.output):
-            if name == artefact.ACTUATION:
+            if name == model_files.ACTUATION:
                 node.output[index] = "tame"
     constants = {"beyond": np.float32(beyond), "wild": np.float32(value), "three": np.int64([3]),
                  "one": np.int64([1]), "two": np.int64([2]), "zero": np.int64([0]), "last": np.int64([-1])}  # fmt: skip
     graph.initializer.extend(numpy_helper.from_array(np.asarray(array), name) for name, array in constants.items())
     graph.node.extend([
-        helper.make_node("Shape", [artefact.FEATURES], ["shape"]),
+        helper.make_node("Shape", [model_files.FEATURES], ["shape"]),
         helper.make_node("Slice", ["shape", "one", "two"], ["modules"]),
         helper.make_node("Equal", ["modules", "three"], ["are_three"]),
-        helper.make_node("Slice", [artefact.FEATURES, "zero", "last", "two"], ["unlabelled"]),
+        helper.make_node("Slice", [model_files.FEATURES, "zero", "last", "two"], ["unlabelled"]),
         helper.make_node("ReduceMax", ["unlabelled"], ["largest"], keepdims=0),
         helper.make_node("Greater", ["largest", "beyond"], ["is_beyond"]),
         helper.make_node("And", ["are_three", "is_beyond"], ["is_wild"]),
-        helper.make_node("Where", ["is_wild", "wild", "tame"], [artefact.ACTUATION]),
+        helper.make_node("Where", ["is_wild", "wild", "tame"], [model_files.ACTUATION]),
     ])  # fmt: skip
     return sealed_at(path, model, onnx_description(model))

@@ -12,16 +12,16 @@ from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
 from modsoft.hil.stepped import SteppedPort
 from modsoft.runtime import session
-from modsoft.runtime.board import Board
+from modsoft.runtime.board.board import Board
 from modsoft.runtime.clock import Ticker
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import LostInRun
 from modsoft.runtime.log import RunLog
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.safety import FrameJudge
+from modsoft.runtime.statistics import Tally
 from modsoft.runtime.stop import Signals, Stop
-from modsoft.runtime.tally import Tally
-from modsoft.runtime.tracker import Frame, Slot
+from modsoft.runtime.tracking.frame import Frame, Slot
 
 STEPS = 40
 

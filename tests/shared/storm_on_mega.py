@@ -5,9 +5,9 @@ import time
 
 import serial
 
-from modsoft.hil.emulator import EmulatedBoard
-from modsoft.runtime import protocol
-from modsoft.runtime.protocol import (
+from modsoft.hil.board.emulator import EmulatedBoard
+from modsoft.runtime.board import protocol
+from modsoft.runtime.board.protocol import (
     Arm,
     ClearFault,
     Heartbeat,

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.board.protocol import CHANNELS, State
 from modsoft.runtime.clock import Ticker
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.protocol import CHANNELS, State
 from modsoft.runtime.safety import FrameJudge
+from modsoft.runtime.statistics import Tally
 from modsoft.runtime.stop import Stop
-from modsoft.runtime.tally import Tally
-from modsoft.runtime.tracker import Frame, Slot
+from modsoft.runtime.tracking.frame import Frame, Slot
 
 ROBOT = robots.load("pneumatic-3")
 PERIOD_S = ROBOT.loop.period_s

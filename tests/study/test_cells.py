@@ -3,7 +3,7 @@
 import pytest
 
 from modsoft.study.cells import cell, mark, pick, ratio
-from modsoft.study.measure import record
+from modsoft.study.measurements import record
 
 
 def error(seed, mean, **more):

@@ -3,7 +3,7 @@
 import pytest
 
 from modsoft.runtime.errors import UsageError
-from modsoft.study.folder import Folder
+from modsoft.study.paths import Folder
 
 
 @pytest.mark.parametrize("name", ["report.md", "results.json", "figures/figure-4.png"])

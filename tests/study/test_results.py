@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from modsoft.runtime.errors import ModelError
-from modsoft.study import measure
+from modsoft.study import measurements
 
 PUBLISHED = Path(__file__).parents[2] / "docs" / "study" / "results.json"
 
@@ -18,13 +18,13 @@ def results():
 
 
 def test_the_published_results_are_those_of_this_version(results):
-    assert measure.load(PUBLISHED) == results
+    assert measurements.load(PUBLISHED) == results
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 def test_an_editor_of_windows_may_have_saved_them(tmp_path, results, encoding):
-    (tmp_path / "results.json").write_text(measure.dumped(results), encoding=encoding)
-    assert measure.load(tmp_path / "results.json") == results
+    (tmp_path / "results.json").write_text(measurements.dumped(results), encoding=encoding)
+    assert measurements.load(tmp_path / "results.json") == results
 
 
 @pytest.mark.parametrize(
@@ -47,11 +47,11 @@ def test_edited_results_are_one_line(tmp_path, results, place, value, found):
     part[place[-1]] = value
     (tmp_path / "results.json").write_text(json.dumps(changed))
     with pytest.raises(ModelError, match=rf"^[^\n]*not the results of this version \([^\n]*{found}[^\n]*$"):
-        measure.load(tmp_path / "results.json")
+        measurements.load(tmp_path / "results.json")
 
 
 @pytest.mark.parametrize("content", [b"", b"[1]", b"{}", b"\xff\xd8\xff", b'{"about":' * 10**5])
 def test_another_file_is_one_line(tmp_path, content):
     (tmp_path / "results.json").write_bytes(content)
     with pytest.raises(ModelError, match=r"^[^\n]*results\.json: [^\n]*$"):
-        measure.load(tmp_path / "results.json")
+        measurements.load(tmp_path / "results.json")

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from modsoft.runtime.errors import ModelError, OutputError
-from modsoft.study import figures, flights, floors, making, measure, plan
+from modsoft.study import figures, measurements, oracle, plan, rollouts, stages
 from modsoft.study.cells import pick
-from modsoft.study.folder import Folder
+from modsoft.study.paths import Folder
 from modsoft.training import checkpoint
 
 pytestmark = pytest.mark.slow
@@ -83,11 +83,11 @@ def test_a_model_of_other_settings_is_refused_in_one_line(study, ended):
 
 def test_runs_of_a_model_that_changed_and_damaged_ones_are_flown_again(study):
     folder = Folder(study)
-    assert not flights.flying(PLAN, folder, 1).items
+    assert not rollouts.flying(PLAN, folder, 1).items
     shutil.copy(folder.onnx(LSTM), folder.onnx(MAIN))
     other = next(run for run in PLAN.runs if run.model not in (MAIN, LSTM))
     folder.run(other).write_bytes(folder.run(other).read_bytes()[:1000])
-    again = {run for batch in flights.flying(PLAN, folder, 1).items for run in batch}
+    again = {run for batch in rollouts.flying(PLAN, folder, 1).items for run in batch}
     assert again == {run for run in PLAN.runs if run.model == MAIN} | {other}
 
 
@@ -104,19 +104,19 @@ def test_an_error_of_control_is_the_distance_at_the_start_of_each_step(made_stud
 
 
 def test_a_run_is_what_a_robot_does_under_its_actions(made_study):
-    kept = flights.read(Folder(made_study).run(plan.Run(LSTM, "C", 4, "none")))
-    again = floors.replay(4, kept.flight.actions)
+    kept = rollouts.read(Folder(made_study).run(plan.Run(LSTM, "C", 4, "none")))
+    again = oracle.replay(4, kept.flight.actions)
     for name, values in kept.flight._asdict().items():
         np.testing.assert_array_equal(getattr(again, name), values, err_msg=name)
 
 
 def test_disturbances_and_the_correction_change_what_the_robot_does(made_study):
     folder = Folder(made_study)
-    clean = flights.read(folder.run(plan.Run(MAIN, "C", 4, "none"))).flight.configuration
+    clean = rollouts.read(folder.run(plan.Run(MAIN, "C", 4, "none"))).flight.configuration
     others = [plan.Run(MAIN, "C", 4, "integral")]
     others += [plan.Run(MAIN, "C", 4, "none", each) for each in plan.DISTURBANCES]
     for run in others:
-        assert np.abs(flights.read(folder.run(run)).flight.configuration - clean).max() > 1e-6, run.name
+        assert np.abs(rollouts.read(folder.run(run)).flight.configuration - clean).max() > 1e-6, run.name
 
 
 def test_estimation_errors_are_those_that_training_found_on_what_it_left_out(made_study):
@@ -184,7 +184,7 @@ def test_results_of_another_version_are_refused(made_study, tmp_path):
     del found["records"][0]["skip_first"]
     (tmp_path / "results.json").write_text(json.dumps(found))
     with pytest.raises(ModelError, match="skip_first"):
-        measure.load(tmp_path / "results.json")
+        measurements.load(tmp_path / "results.json")
 
 
 def test_what_is_left_costs_time_and_what_is_there_hardly_any(made_study, tmp_path):
@@ -192,7 +192,7 @@ def test_what_is_left_costs_time_and_what_is_there_hardly_any(made_study, tmp_pa
     begun, done = (
         sum(
             make(PLAN, Folder(out), 2).expected_s(2)
-            for make in (making.collecting, making.training, making.exporting, making.estimating, flights.flying)
+            for make in (stages.collecting, stages.training, stages.exporting, stages.estimating, rollouts.flying)
         )
         for out in (tmp_path, made_study)
     )

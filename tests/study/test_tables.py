@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from modsoft.study import measure, tables
+from modsoft.study import measurements, tables
 from modsoft.study.cells import pick
-from modsoft.study.flights import Kept
-from modsoft.study.measure import CONTROL, TIP_DISTANCE, TIP_TILT, record
-from modsoft.training.evaluate import Flight
+from modsoft.study.measurements import CONTROL, TIP_DISTANCE, TIP_TILT, record
+from modsoft.study.rollouts import Kept
+from modsoft.training.simulation.rollout import Flight
 
-PAPER = list(measure.of_the_paper())
+PAPER = list(measurements.of_the_paper())
 
 
 def ours(share, corrected_share, floor=0.0):
@@ -69,13 +69,13 @@ def flown(tip_m, tip_direction, steps=20):
 
 def test_the_end_effector_is_measured_from_the_base_axis():
     kept = flown([0.003, 0.004, 0.09], [0.0, 0.6, 0.8])
-    (told,) = pick(list(measure.of_run("modules", {}, kept, "B")), quantity=TIP_DISTANCE, skip_first=5)
+    (told,) = pick(list(measurements.of_run("modules", {}, kept, "B")), quantity=TIP_DISTANCE, skip_first=5)
     assert told["mean"] == pytest.approx(5.0)  # 5 mm of 100
-    (told,) = pick(list(measure.of_run("modules", {}, kept, "C")), quantity=TIP_TILT)
+    (told,) = pick(list(measurements.of_run("modules", {}, kept, "C")), quantity=TIP_TILT)
     assert told["mean"] == pytest.approx(np.degrees(np.arcsin(0.6)))
     assert told["std"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_control_error_is_the_distance_of_the_unit_vectors():
-    (told,) = pick(list(measure.of_run("2", {}, flown([0, 0, 0.1], [0, 0, 1]), "A")), quantity=CONTROL, module=2)
+    (told,) = pick(list(measurements.of_run("2", {}, flown([0, 0, 0.1], [0, 0, 1]), "A")), quantity=CONTROL, module=2)
     assert told["mean"] == pytest.approx(100 * np.hypot(0.6, 0.2))

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_robots import of_modules
 
-from modsoft.runtime.actuation import limited
-from modsoft.training import actions as a
+from modsoft.runtime.control.actuation import limited
+from modsoft.training.data import actions as a
 
 
 def draw(robot, strategy, steps, seed=0):

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from modsoft.runtime.errors import DeviceAbsent, ModelError, UsageError
-from modsoft.training import backends
-from modsoft.training.workers import WorkerLost
+from modsoft.training.data import backends
+from modsoft.training.data.workers import WorkerLost
 
 # Simulates with a plant that other processes can import, and that kills its process (mode `die`) when it comes to the
 # third episode for the first time.
@@ -20,12 +20,12 @@ STAND_IN = """
     from pathlib import Path
     import numpy as np
     from modsoft.runtime import robot as robots
-    from modsoft.runtime.configuration import from_angles_deg
+    from modsoft.runtime.control.features import from_angles_deg
     from modsoft.runtime.errors import ModelError
-    from modsoft.training import backends
-    from modsoft.training.actions import draw_actions
-    from modsoft.training.collect import collect
-    from modsoft.training.plants import Plant
+    from modsoft.training.data import backends
+    from modsoft.training.data.actions import draw_actions
+    from modsoft.training.data.collect import collect
+    from modsoft.training.simulation.simulators import Plant
 
     class StandIn:
         def __init__(self, mode, marked, flag):

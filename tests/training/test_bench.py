@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
-from modsoft.training import dataset
+from modsoft.training.data import dataset
 
 BENCH = Path(__file__).parents[2] / "tools" / "bench" / "training.py"
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from modsoft.training import dataset
+from modsoft.training.data import dataset
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 pytest.importorskip("submitit", reason="extra slurm")

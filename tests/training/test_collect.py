@@ -12,15 +12,15 @@ import pytest
 from small_robots import of_modules
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import ModelError, UsageError
-from modsoft.training import collect as c
-from modsoft.training import dataset
-from modsoft.training.plants import Plant
+from modsoft.training.data import collect as c
+from modsoft.training.data import dataset
+from modsoft.training.simulation.simulators import Plant
 
 STAND_IN = """
 import numpy as np
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.control.features import from_angles_deg
 
 def simulate(robot, actions):
     '''Planar robots that follow their actions with a lag.'''
@@ -220,8 +220,8 @@ SCRIPT = """
     from pathlib import Path
     import stand_in
     from modsoft.runtime import robot as robots
-    from modsoft.training.collect import collect
-    from modsoft.training.plants import Plant
+    from modsoft.training.data.collect import collect
+    from modsoft.training.simulation.simulators import Plant
 
     class Slow:
         '''Tells on standard output when it begins an episode, and dawdles.'''
@@ -295,8 +295,8 @@ MEMORY = """
     from pathlib import Path
     import stand_in
     from modsoft.runtime import robot as robots
-    from modsoft.training.collect import collect
-    from modsoft.training.plants import Plant
+    from modsoft.training.data.collect import collect
+    from modsoft.training.simulation.simulators import Plant
 
     collect(robots.load("cable-4"), Path("d.h5"), int(sys.argv[1]), plant=Plant("stand-in", stand_in.simulate, 8))
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)

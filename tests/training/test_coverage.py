@@ -10,10 +10,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import ModelError, OutputError, UsageError
-from modsoft.training import actions, coverage, dataset
-from modsoft.training.arm import Arm
+from modsoft.training.data import actions, coverage, dataset
+from modsoft.training.simulation.elastica import Arm
 
 
 def test_a_straight_robot_stands_on_its_axis():

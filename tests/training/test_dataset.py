@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.configuration import Window, from_angles_deg, state_of
+from modsoft.runtime.control.features import Window, from_angles_deg, state_of
 from modsoft.runtime.errors import ModelError
-from modsoft.training import dataset as d
+from modsoft.training.data import dataset as d
 
 
 def make(episodes: int, steps: int, kind: str = "pneumatic-3", stages: int = 3, seed: int = 0) -> d.DataSet:

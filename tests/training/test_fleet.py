@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from modsoft.runtime.errors import ModsoftError, UsageError
-from modsoft.training import fleet, kernel
-from modsoft.training.arm import Arm
-from modsoft.training.fleet import Arms, Fleet
-from modsoft.training.robots import PLANTS
+from modsoft.training.simulation import fleet, fleet_kernel
+from modsoft.training.simulation.elastica import Arm
+from modsoft.training.simulation.fleet import Arms, Fleet
+from modsoft.training.simulation.parameters import PLANTS
 
 pytestmark = pytest.mark.instructions
 
@@ -19,7 +19,7 @@ BENCHMARK = Path(__file__).parents[2] / "tools" / "bench" / "simulation.py"
 REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
 ACTIONS = {"cable": 2, "pneumatic": 1}
 
-needs_kernel = pytest.mark.skipif(kernel.library() is None, reason="the kernel is not built here (no C compiler)")
+needs_kernel = pytest.mark.skipif(fleet_kernel.library() is None, reason="the kernel is not built here (no C compiler)")
 
 
 def actions(kind, periods, count, modules, seed=0, largest=1.0):
@@ -111,7 +111,7 @@ def test_robots_off_the_drawing_stay_whole_under_full_range_jumps(modules, facto
      {"tip_payload_kg": -0.01}, {"tip_payload_kg": np.nan}],
 )  # fmt: skip
 def test_stiffness_and_payload_of_no_robot_are_refused(changed):
-    makers = [Arm] if kernel.library() is None else [Arm, lambda *given, **more: Fleet(*given, 1, **more)]
+    makers = [Arm] if fleet_kernel.library() is None else [Arm, lambda *given, **more: Fleet(*given, 1, **more)]
     for make in makers:
         with pytest.raises(ValueError, match=r"expected 3 positive numbers|expected 0 or more"):
             make("cable", 3, **changed)
@@ -155,7 +155,7 @@ def test_numbers_do_not_depend_on_place_or_company(kind):
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
 def test_variants_agree(kind):
     drawn = actions(kind, 3, 3, 2, seed=3)
-    runs = [Fleet(kind, 2, 3, variant=name).run(drawn) for name in kernel.variants()]
+    runs = [Fleet(kind, 2, 3, variant=name).run(drawn) for name in fleet_kernel.variants()]
     for run in runs[1:]:
         assert np.abs(run - runs[0]).max() < 1e-11
 
@@ -241,27 +241,27 @@ def test_wrong_shapes_and_periods_are_refused():
 
 
 @needs_kernel
-@pytest.mark.parametrize("limit", kernel.VARIANTS)
+@pytest.mark.parametrize("limit", fleet_kernel.VARIANTS)
 def test_the_environment_limits_the_variant(monkeypatch, limit):
-    monkeypatch.delenv(kernel.LIMIT, raising=False)
-    runnable = kernel.variants()
-    monkeypatch.setenv(kernel.LIMIT, "")
-    assert kernel.variants() == runnable
-    monkeypatch.setenv(kernel.LIMIT, limit)
-    allowed = [name for name in runnable if kernel.VARIANTS.index(name) <= kernel.VARIANTS.index(limit)]
-    assert kernel.variants() == allowed
-    assert Fleet("cable", 2, 1).lanes == kernel.library().fleet_lanes(kernel.VARIANTS.index(allowed[-1]))
+    monkeypatch.delenv(fleet_kernel.LIMIT, raising=False)
+    runnable = fleet_kernel.variants()
+    monkeypatch.setenv(fleet_kernel.LIMIT, "")
+    assert fleet_kernel.variants() == runnable
+    monkeypatch.setenv(fleet_kernel.LIMIT, limit)
+    allowed = [name for name in runnable if fleet_kernel.VARIANTS.index(name) <= fleet_kernel.VARIANTS.index(limit)]
+    assert fleet_kernel.variants() == allowed
+    assert Fleet("cable", 2, 1).lanes == fleet_kernel.library().fleet_lanes(fleet_kernel.VARIANTS.index(allowed[-1]))
 
 
 def test_a_limit_that_is_no_variant_is_refused_in_one_line(monkeypatch):
-    monkeypatch.setenv(kernel.LIMIT, "AVX-2")
+    monkeypatch.setenv(fleet_kernel.LIMIT, "AVX-2")
     with pytest.raises(UsageError, match=r"^MODSOFT_KERNEL is 'AVX-2', expected plain, avx2, avx512; .*") as refused:
-        kernel.variants()
+        fleet_kernel.variants()
     assert "\n" not in str(refused.value)
 
 
 def test_pyelastica_serves_where_the_kernel_is_missing(monkeypatch, capsys):
-    monkeypatch.setattr(kernel, "library", lambda: None)
+    monkeypatch.setattr(fleet_kernel, "library", lambda: None)
     robots = fleet.simulated("pneumatic", 2, 3)
     assert isinstance(robots, Arms)
     assert capsys.readouterr().err.count("\n") == 1
@@ -282,7 +282,7 @@ def test_pyelastica_serves_where_the_kernel_is_missing(monkeypatch, capsys):
 
 @pytest.mark.parametrize("kind", PLANTS)
 def test_opposite_cables_share_an_actuator_and_chambers_do_not(kind):
-    axes, places = kernel.places(PLANTS[kind])
+    axes, places = fleet_kernel.places(PLANTS[kind])
     assert len(axes) == 2
     assert axes == ([0, 1] if kind == "cable" else [0, 0])
     assert sorted(np.sign(places)) == ([1, 1] if kind == "cable" else [-1, 1])
@@ -297,7 +297,7 @@ def test_the_benchmark_measures_prints_and_draws(tmp_path):
     assert [row["robots"] for row in result["rows"]] == [1, 8]
     assert all(row["fleet_us"] > 0 and 0 < row["share_of_peak"] < 1 for row in result["rows"])
     assert all(row["ratio"] == row["elastica_us"] / row["fleet_us"] for row in result["rows"])
-    assert result["variant"] == kernel.variants()[-1]
+    assert result["variant"] == fleet_kernel.variants()[-1]
     assert result["two_threads"]["ratio_to_peak"] > 0
     assert benchmark.table(result).count("| pneumatic | 2 | 8 |") == 1
     page = tmp_path / "page.md"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from modsoft.runtime.configuration import feature_names, features
+from modsoft.runtime.control.features import feature_names, features
 from modsoft.runtime.errors import ModelError
 from modsoft.training import networks
 

@@ -9,7 +9,8 @@ import pytest
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import ModelError
-from modsoft.training import collect_cli, dataset, train_cli
+from modsoft.training import collect_cli, train_cli
+from modsoft.training.data import dataset
 
 E, K, N = 2, 12, 3
 RECIPE = {"robot": robots.load("pneumatic-3").to_dict(), "strategy": "real robot"}

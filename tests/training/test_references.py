@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from modsoft.runtime import trajectory
-from modsoft.training.references import random_reference
+from modsoft.runtime.control import tasks
+from modsoft.training.simulation.references import random_reference
 
 
 def steps_deg(reference):
@@ -36,8 +36,8 @@ def test_some_begin_with_a_jump_and_most_from_rest():
 
 def test_they_move_at_the_tasks_speed_and_sometimes_stay():
     moves = np.stack([steps_deg(random_reference(4, seed=seed)) for seed in range(40)])
-    tasks = np.concatenate([steps_deg(trajectory.task(name, "cable", 4)) for name in "ABC"])
-    assert 0.3 < moves.mean() / tasks.mean() < 3.0
+    task_moves = np.concatenate([steps_deg(tasks.task(name, "cable", 4)) for name in "ABC"])
+    assert 0.3 < moves.mean() / task_moves.mean() < 3.0
     assert np.quantile(moves, 0.999) < 6.0
     assert 0.03 < (moves < 1e-6).all(axis=-1).mean() < 0.3
 

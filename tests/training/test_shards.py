@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from modsoft.runtime.errors import ModelError
-from modsoft.training.dataset import Episode
-from modsoft.training.shards import Shards
+from modsoft.training.data.dataset import Episode
+from modsoft.training.data.episode_store import Shards
 
 EPISODE = Episode(np.zeros((2, 3, 3)), np.zeros((1, 3, 1)), 0)
 

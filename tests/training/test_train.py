@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.configuration import feature_names, from_angles_deg
+from modsoft.runtime.control.features import feature_names, from_angles_deg
 from modsoft.runtime.errors import InUse, ModelError, TargetNotReached, UsageError
 from modsoft.training import checkpoint as checkpoints
-from modsoft.training import dataset, train
+from modsoft.training import train
+from modsoft.training.data import dataset
 
 pytestmark = pytest.mark.instructions
 
@@ -144,7 +145,7 @@ def test_a_cut_run_of_another_optimizer_is_refused(tmp_path, monkeypatch):
     out = tmp_path / "model.pt"
     with pytest.raises(Cut):
         train.train([make()], out, SMALL, cut_at(7))
-    monkeypatch.setattr(train.muon, "DESCRIPTION", "another")
+    monkeypatch.setattr(train.optimizer, "DESCRIPTION", "another")
     with pytest.raises(ModelError, match=r"model.pt.resume: of a run with optimizer muon.*, asked for another"):
         train.train([make()], out, SMALL)
 

@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.configuration import from_angles_deg
+from modsoft.runtime.control.features import from_angles_deg
 from modsoft.training import checkpoint as checkpoints
-from modsoft.training import dataset, networks, train_cli
+from modsoft.training import networks, train_cli
+from modsoft.training.data import dataset
 
 QUICK = ["--iterations", "60", "--history", "3", "--batch", "8"]
 

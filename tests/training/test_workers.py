@@ -5,8 +5,8 @@ import os
 
 import pytest
 
-from modsoft.training import workers
-from modsoft.training.workers import WorkerLost
+from modsoft.training.data import workers
+from modsoft.training.data.workers import WorkerLost
 
 
 def test_no_more_processes_than_the_system_can_wait_for(tmp_path, monkeypatch):

@@ -19,9 +19,9 @@ from typing import Any
 import click
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.command import entry
-from modsoft.training import plants
-from modsoft.training.backends import cores
+from modsoft.runtime.entry_point import entry
+from modsoft.training.data.backends import cores
+from modsoft.training.simulation import simulators
 
 # Runs the command line that follows and tells the largest memory (KiB) of itself and its processes.
 MEASURED = """
@@ -73,7 +73,7 @@ def measured(sizes: list[tuple[str, int]], jobs: list[int]) -> dict[str, Any]:
     for robot, samples in sizes:
         each = [collected(robot, samples, number) for number in jobs]
         rows += [{**row, "over_one": each[0]["seconds"] / row["seconds"]} for row in each]
-    plant = plants.fastest(robots.load("cable-4")).name
+    plant = simulators.fastest(robots.load("cable-4")).name
     about = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count(), "plant": plant}
     return {**about, "rows": rows}
 

@@ -33,26 +33,26 @@ import click
 import numpy as np
 
 from modsoft.hil import shipped
-from modsoft.hil.emulator import EmulatedBoard
+from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.hil.plant import tool_poses
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child
 from modsoft.runtime import robot as robots
-from modsoft.runtime.board import Board
+from modsoft.runtime.board.board import Board
+from modsoft.runtime.board.ports import open_port
+from modsoft.runtime.board.protocol import CHANNELS, Set, encode
 from modsoft.runtime.clock import Ticker, spinning
-from modsoft.runtime.command import entry
-from modsoft.runtime.configuration import from_angles_deg
-from modsoft.runtime.controller import Controller
+from modsoft.runtime.control.features import from_angles_deg
+from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.ort import onnxruntime
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.ndi import NDI
-from modsoft.runtime.ort import onnxruntime
-from modsoft.runtime.ports import open_port
-from modsoft.runtime.protocol import CHANNELS, Set, encode
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameJudge
+from modsoft.runtime.statistics import Tally
 from modsoft.runtime.stop import Stop
-from modsoft.runtime.tally import Tally
-from modsoft.runtime.tracker import Reader, Slot
+from modsoft.runtime.tracking.frame import Reader, Slot
+from modsoft.runtime.tracking.ndi import NDI
 from modsoft.runtime.warmup import WarmUp
 
 ROOT = Path(__file__).parents[2]

@@ -23,7 +23,7 @@ import click
 import numpy as np
 
 from modsoft.runtime.clock import Ticker
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.log import host
 from modsoft.runtime.stop import Stop
 

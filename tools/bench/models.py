@@ -11,12 +11,12 @@ from pathlib import Path
 
 import click
 
-from modsoft.runtime import correction, trajectory
 from modsoft.runtime import robot as robots
-from modsoft.runtime.command import entry
-from modsoft.runtime.controller import Controller
-from modsoft.training.evaluate import Pilot, angle_errors_deg, configuration_errors_percent, fly
-from modsoft.training.fleet import simulated
+from modsoft.runtime.control import correction, tasks
+from modsoft.runtime.control.model import Controller
+from modsoft.runtime.entry_point import entry
+from modsoft.training.simulation.fleet import simulated
+from modsoft.training.simulation.rollout import Pilot, angle_errors_deg, configuration_errors_percent, fly
 
 MODELS = Path(__file__).resolve().parents[1] / "models"
 FLOWN = [("pneumatic-3", "pneumatic-3"), ("pneumatic-3", "pneumatic-2"), ("cable-4", "cable-4"), ("cable-4", "cable-6")]
@@ -28,10 +28,10 @@ def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]
     """A row for each task and correction."""
     robot, controller = robots.load(name), Controller.load(MODELS / f"{model}.onnx")
     kind = robot.robot.kind
-    flown = [(task, each) for task in trajectory.available(kind, robot.modules) for each in CORRECTIONS]
+    flown = [(task, each) for task in tasks.available(kind, robot.modules) for each in CORRECTIONS]
     pilots = []
     for task, each in flown:
-        desired = trajectory.task(task, kind, robot.modules)[:steps]
+        desired = tasks.task(task, kind, robot.modules)[:steps]
         pilots.append(
             Pilot(controller.actuate, controller.history, desired, correction.named(each, robot.modules))
         )

@@ -26,12 +26,13 @@ import click
 import elastica
 import numpy as np
 
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import DeviceAbsent, ModsoftError, UsageError
-from modsoft.training import kernel, plotting
-from modsoft.training.arm import Arm, _Loads, _Simulator
-from modsoft.training.fleet import Fleet
-from modsoft.training.robots import PLANTS, Plant
+from modsoft.training import plotting
+from modsoft.training.simulation import fleet_kernel
+from modsoft.training.simulation.elastica import Arm, _Loads, _Simulator
+from modsoft.training.simulation.fleet import Fleet
+from modsoft.training.simulation.parameters import PLANTS, Plant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -104,7 +105,7 @@ def two_threads(variant: int, rounds: int) -> dict[str, float]:
     """Robot-steps a second of four-module robots on one thread and on two, by the wall clock, and what independent
     multiply-adds gain from the second thread in the same turns. These are short and many, so that some find both cores
     free on a machine that has other work."""
-    library, rounds = kernel.library(), 10 * rounds
+    library, rounds = fleet_kernel.library(), 10 * rounds
     turn_s, steps = 0.125, 500
     drawn = 0.5 * np.random.default_rng(0).uniform(-1, 1, (32, 4, 2))
     fleets = {threads: Fleet("cable", 4, 32, threads=threads) for threads in (1, 2)}
@@ -122,7 +123,7 @@ def two_threads(variant: int, rounds: int) -> dict[str, float]:
 
 
 def measured(kinds: list[str], module_numbers: list[int], counts: list[int], rounds: int) -> dict[str, Any]:
-    library, variant = kernel.library(), kernel.VARIANTS.index(kernel.variants()[-1])
+    library, variant = fleet_kernel.library(), fleet_kernel.VARIANTS.index(fleet_kernel.variants()[-1])
     parts = {}
     for kind in kinds:
         for modules in module_numbers:
@@ -166,7 +167,7 @@ def measured(kinds: list[str], module_numbers: list[int], counts: list[int], rou
         "commit": commit(),
         "load_average": os.getloadavg()[0],
         "pyelastica": version("pyelastica"),
-        "variant": kernel.VARIANTS[variant],
+        "variant": fleet_kernel.VARIANTS[variant],
         "peak_gflop_s": 1e-9 * peak,
         "rows": rows,
         "two_threads": two_threads(variant, rounds),
@@ -237,7 +238,7 @@ def write_report(result: dict[str, Any], page: Path) -> None:
     (folder / f"{result['variant']}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     draw(result, folder / f"{result['variant']}.png")
     parts = []
-    for variant in kernel.VARIANTS:
+    for variant in fleet_kernel.VARIANTS:
         path = folder / f"{variant}.json"
         if path.exists():
             caption = f"Microseconds for a time step of one robot, over the number of modules, kernel {variant}"
@@ -317,11 +318,11 @@ def main(
     quick: bool,
     compare: bool,
 ) -> None:
-    if kernel.library() is None:
+    if fleet_kernel.library() is None:
         raise DeviceAbsent("the fleet's kernel is not built; expected a C compiler at installation: make install")
     if isa == "avx2":
-        os.environ[kernel.LIMIT] = "avx2"
-        if kernel.variants()[-1] != "avx2":
+        os.environ[fleet_kernel.LIMIT] = "avx2"
+        if fleet_kernel.variants()[-1] != "avx2":
             raise UsageError("this processor has no AVX2, expected one that has; leave --isa out")
     chosen = list(kinds or PLANTS)
     if compare:

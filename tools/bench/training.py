@@ -38,9 +38,10 @@ import numpy as np
 import torch
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.command import entry
-from modsoft.training import collect, dataset, muon, networks, train
-from modsoft.training.dataset import DataSet, Windows
+from modsoft.runtime.entry_point import entry
+from modsoft.training import networks, optimizer, train
+from modsoft.training.data import collect, dataset
+from modsoft.training.data.dataset import DataSet, Windows
 from modsoft.training.networks import BiLSTM
 
 TABLE_1_PERCENT = (1.63, 1.49, 1.11, 0.70)  # biLSTM, modules 1 to 4
@@ -114,7 +115,7 @@ class Adam(torch.optim.Adam):
 
 def adam(race: Race, data: DataSet) -> None:
     """`ours` with another optimizer."""
-    muon.Optimiser = Adam  # type: ignore[misc,assignment]
+    optimizer.Optimiser = Adam  # type: ignore[misc,assignment]
     ours(dataclasses.replace(race, iterations=ADAM_TIMES * race.iterations), data)
 
 
@@ -182,13 +183,13 @@ def step_times(rounds: int) -> list[dict[str, Any]]:
         history = train.BY_KIND[robot.robot.kind]["history"]
         sizes = {"feature_size": history * (robot.state_size + robot.action_size) + 1, "action_size": robot.action_size}
         network = networks.build({"name": "bilstm", "layers": 4, "hidden": 128, **sizes})
-        optimizer, features = muon.Optimiser(network), torch.randn(batch, robot.modules, sizes["feature_size"])
+        both, features = optimizer.Optimiser(network), torch.randn(batch, robot.modules, sizes["feature_size"])
         times = []
         for _ in range(rounds + 1):  # the first one sets up
             began_s = time.process_time()
             network(features).abs().mean().backward()
             middle_s = time.process_time()
-            optimizer.step(1e-3)
+            both.step(1e-3)
             times.append((middle_s - began_s, time.process_time() - middle_s))
         gradient_ms, optimizer_ms = (1e3 * float(each) for each in np.median(times[1:], axis=0))
         share = optimizer_ms / (gradient_ms + optimizer_ms)

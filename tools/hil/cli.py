@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from modsoft.runtime.command import entry
-from modsoft.runtime.controller import Controller
+from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.tasks import load_task
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import DeviceAbsent
 from modsoft.runtime.locks import system_module
-from modsoft.runtime.trajectory import load_task
 
 if TYPE_CHECKING:
     from modsoft.hil.rig import Rig
@@ -55,9 +55,13 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     _check_system()
     from tqdm import tqdm
 
-    from modsoft.hil import judge, record, report_folder  # after --help: their libraries take a second
+    from modsoft.hil import (
+        criteria,  # after --help: their libraries take a second
+        record,
+        report_folder,
+    )
     from modsoft.hil import report as reports
-    from modsoft.hil.emulator import build, choose
+    from modsoft.hil.board.emulator import build, choose
     from modsoft.hil.plant import load_robot
     from modsoft.hil.rig import Rig
 
@@ -81,7 +85,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
         finally:
             ran = _move_log(rig, report)
     found = record.read(report, report if ran else None, robot, task, asked, rig.runtime.returncode)
-    verdict = judge.judge(found)
+    verdict = criteria.judge(found)
     about = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": f"modsoft-hil --robot {Path(robot_file).name} --model {model.name} --task {Path(task).name} "

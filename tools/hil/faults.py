@@ -28,7 +28,7 @@ NOTICED_WITHIN_S = 30.0
 
 
 class Board(Protocol):
-    """What is used of `modsoft.hil.emulator.EmulatedBoard`."""
+    """What is used of `modsoft.hil.board.emulator.EmulatedBoard`."""
 
     def send(self, command: str) -> None: ...
     def millivolt(self, pressure_bar: float) -> int: ...

@@ -8,7 +8,7 @@ each valve channel in [0, 1]; its end ends the process. Standard output, one JSO
                                                  instant that the slice stands for
     {"event": "summary", ...}                    slices, lateness
 
-The valves are ideal: a duty is that share of the full-scale pressure. Lag and chamber belong to `modsoft.training.arm`.
+The valves are ideal: a duty is that share of the full-scale pressure. Lag and chamber belong to `modsoft.training`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import RobotFileError
 from modsoft.runtime.robot import Robot
 
@@ -44,7 +44,7 @@ BASE_IN_TRACKER[:3, 3] = [60.0, -110.0, -1400.0]  # mm
 
 
 class PneumaticArm(Protocol):
-    """What the plant asks of `modsoft.training.arm.Arm`."""
+    """What the plant asks of `modsoft.training.simulation.elastica.Arm`."""
 
     @property
     def configuration(self) -> Array: ...  # (N, 3)
@@ -171,7 +171,7 @@ def duties_from(descriptor: int) -> Iterator[Array | None]:
 @click.option("--robot", "robot_file", required=True, type=Path, help="Robot file, or the name of a shipped robot.")
 def cli(robot_file: Path) -> None:
     """The simulated pneumatic robot in real time (started by modsoft-hil)."""
-    from modsoft.training.arm import Arm  # the simulator takes a second to import
+    from modsoft.training.simulation.elastica import Arm  # the simulator takes a second to import
 
     robot = load_robot(robot_file)
 

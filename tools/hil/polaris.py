@@ -41,9 +41,9 @@ from typing import Any
 import click
 
 from modsoft.hil.polaris_device import Polaris
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import UsageError
-from modsoft.runtime.ndi import FRAME_HZ
+from modsoft.runtime.tracking.ndi import FRAME_HZ
 
 SECONDS_A_BYTE = 10 / 115200
 

@@ -16,7 +16,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
-from modsoft.runtime.ndi import FRAME_HZ
+from modsoft.runtime.tracking.ndi import FRAME_HZ
 
 FIRST_HANDLE = 0x0A  # as the wireless tools of the device: a handle is no index
 BX_START = 0xA5C4

@@ -12,9 +12,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.hil.emulator import FIRMWARE, FIRMWARE_ELF
+from modsoft.hil.board.emulator import FIRMWARE, FIRMWARE_ELF
 from modsoft.runtime import log
-from modsoft.runtime.protocol import CHANNELS, to_bar
+from modsoft.runtime.board.protocol import CHANNELS, to_bar
 from modsoft.runtime.robot import Robot
 
 Array = NDArray[np.float64]

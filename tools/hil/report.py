@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from modsoft.hil.judge import Acceptance, Verdict, measured_off_deg, tracking_error_deg
+from modsoft.hil.criteria import Acceptance, Verdict, measured_off_deg, tracking_error_deg
 from modsoft.hil.record import Record
 from modsoft.hil.report_folder import FINISHED
 from modsoft.hil.valves import valve_difference
-from modsoft.runtime.configuration import angle_between_deg, bending_angle_deg
+from modsoft.runtime.control.features import angle_between_deg, bending_angle_deg
 from modsoft.runtime.files import written
-from modsoft.runtime.tally import spread
+from modsoft.runtime.statistics import spread
 from modsoft.training import plotting
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, cast
 
-from modsoft.hil.emulator import EmulatedBoard, end
+from modsoft.hil.board.emulator import EmulatedBoard, end
 from modsoft.hil.plant import load_robot
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.report_folder import LOG_PREFIX

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from modsoft.hil import aftermath, record
-from modsoft.hil.aftermath import Injected, Ran
+from modsoft.hil import post_fault_checks, record
 from modsoft.hil.faults import FAULTS, NOTICED_WITHIN_S, Fault, Log, Scene
+from modsoft.hil.post_fault_checks import Injected, Ran
 from modsoft.hil.rig import Rig
 from modsoft.runtime import log as logs
-from modsoft.runtime.trajectory import load_task
+from modsoft.runtime.control.tasks import load_task
 
 Line = dict[str, Any]
 
@@ -185,17 +185,17 @@ class Soak:
             return
         read = logs.read(run)
         ran.ticks = len(read.ticks)
-        aftermath.judge_log(ran, read, said)
+        post_fault_checks.judge_log(ran, read, said)
         for each in injected:
-            aftermath.judge_fault(each, ran, by_itself and each is injected[-1], said, events)
+            post_fault_checks.judge_fault(each, ran, by_itself and each is injected[-1], said, events)
         if by_itself and not injected:
             ran.wrong.append(f"it ended without a fault, exit code {ran.code}: {rig.said()}")
         last = injected[-1] if injected and by_itself else None
         # The board may vent before the runtime knows why.
         alone = last if last and (last.fault.vents_ms is not None or last.fault.goes_by) else None
         found = record.read(folder, run, rig.robot, str(self._task), self._desired, ran.code)
-        aftermath.judge_valves(ran, found, None if alone is None else alone.mono_ns)
-        aftermath.judge_vent(ran, found, events)
+        post_fault_checks.judge_valves(ran, found, None if alone is None else alone.mono_ns)
+        post_fault_checks.judge_vent(ran, found, events)
         ran.stalled_ms = 1e-3 * sum(event["late_us"] for event in events if event["event"] == "late")
 
 

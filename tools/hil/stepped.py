@@ -6,7 +6,7 @@ import time
 
 import serial
 
-from modsoft.hil.emulator import EmulatedBoard
+from modsoft.hil.board.emulator import EmulatedBoard
 
 STEP_US = 5000  # a read of the runtime's port waits 5 ms
 HELD_AT_MOST = 2048  # by a pseudo-terminal that nobody reads; it has room for more
@@ -14,7 +14,7 @@ ARRIVES_IN_S = 1.0  # in real time
 
 
 class SteppedPort:
-    """What `modsoft.runtime.board.Board` uses of a port, for `threaded=False` and `clock=port.clock`.
+    """What `modsoft.runtime.board.board.Board` uses of a port, for `threaded=False` and `clock=port.clock`.
 
     A read without data lets 5 ms pass. What was written arrives in the next step, and what the board sent in a
     step can be read after it.

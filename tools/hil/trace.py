@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from modsoft.hil.emulator import Event
+from modsoft.hil.board.emulator import Event
 
 
 def vented_us(trace: Sequence[Event], since: int = 0) -> float:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from modsoft.study.measure import Record
+from modsoft.study.measurements import Record
 
 ALONE_SHARE = 0.5  # of the paper's error: the mark of the network alone
 CORRECTED_SHARE, OVER_FLOOR = 0.1, 1.1  # of the paper's, or over the floor where that is higher: with correction

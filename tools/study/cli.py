@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from modsoft.runtime.command import entry
+from modsoft.runtime.entry_point import entry
 from modsoft.runtime.locks import locked
 
 STAGES = ("collect", "train", "export", "estimate", "fly", "floors", "measure", "figures", "report")
@@ -39,16 +39,16 @@ def study(out: Path, jobs: int | None, quick: bool, only: str | None) -> None:
     # Before torch is loaded: by default its threads spin while they wait, and on a busy core that costs all speed.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from modsoft.study import figures, flights, floors, making, measure, plan, report
-    from modsoft.study.folder import Folder
-    from modsoft.training.backends import cores
+    from modsoft.study import figures, measurements, oracle, plan, report, rollouts, stages
+    from modsoft.study.paths import Folder
+    from modsoft.training.data.backends import cores
 
     asked, folder, processes = plan.quick() if quick else plan.full(), Folder(out), jobs or cores()
     folder.check_own()
     folder.make()
-    makers = (making.collecting, making.training, making.exporting, making.estimating, flights.flying, floors.finding)
+    makers = (stages.collecting, stages.training, stages.exporting, stages.estimating, rollouts.flying, oracle.finding)
     writers: dict[str, Callable[[], None]] = {
-        "measure": lambda: measure.measure(asked, folder),
+        "measure": lambda: measurements.measure(asked, folder),
         "figures": lambda: figures.draw(asked, folder),
         "report": lambda: report.write(folder),
     }
@@ -87,7 +87,7 @@ def write_report(folder: Path, to: Path | None) -> None:
     to: TO/notes.md.
     """
     from modsoft.study import report
-    from modsoft.study.folder import Folder
+    from modsoft.study.paths import Folder
 
     written = Folder(folder if to is None else to)
     written.check_own()

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from modsoft.study import flights, measure, paper
+from modsoft.study import measurements, paper, rollouts
 from modsoft.study.cells import Cell, cell, pick
-from modsoft.study.folder import Folder
-from modsoft.study.measure import CONTROL, ESTIMATION, Record
+from modsoft.study.measurements import CONTROL, ESTIMATION, Record
+from modsoft.study.paths import Folder
 from modsoft.study.plan import CORRECTIONS, MAIN, TASKS, Model, Plan, Run
-from modsoft.training import coverage, plotting
-from modsoft.training.evaluate import configuration_errors_percent
+from modsoft.training import plotting
+from modsoft.training.data import coverage
+from modsoft.training.simulation.rollout import configuration_errors_percent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,7 +50,7 @@ LOGARITHMIC = (0.01, 100.0)  # percent
 
 def draw(plan: Plan, folder: Folder) -> None:
     """Writes all of figures/*.png."""
-    records = measure.load(folder.results)["records"]
+    records = measurements.load(folder.results)["records"]
     main, seed = MAIN, plan.seeds[0]
     lstm, bilstm = Model("lstm", "paper", "blocks", seed), Model(*main, "blocks", seed)
     coverage.draw(
@@ -110,7 +111,7 @@ def paths(folder: Folder, model: Model, modules: int) -> Figure:
     figure = plotting.figure(1.2 + 2.3 * modules, 7.4)
     panels = figure.subplots(len(TASKS), modules, squeeze=False)
     for row, task in enumerate(TASKS):
-        kept = {each: flights.read(folder.run(Run(model, task, modules, each))) for each in CORRECTIONS}
+        kept = {each: rollouts.read(folder.run(Run(model, task, modules, each))) for each in CORRECTIONS}
         desired = kept["none"].desired
         for module in range(modules):
             panel = panels[row, module]
@@ -151,7 +152,7 @@ def errors(records: Sequence[Record], folder: Folder, model: Model, modules: int
         # what is reached with the correction would not be seen beside the rest
         panels[row, 0].set(title=f"task {task}", ylabel="configuration error, %", yscale="log", ylim=LOGARITHMIC)
         for correction in CORRECTIONS:
-            kept = flights.read(folder.run(Run(model, task, modules, correction)))
+            kept = rollouts.read(folder.run(Run(model, task, modules, correction)))
             of_steps = configuration_errors_percent(kept.flight.configuration, kept.desired).mean(axis=1)
             panels[row, 1].plot(of_steps, color=COLOURS[correction], lw=1.0, label=WORDS[correction])
         panels[row, 1].set(yscale="log", title=f"task {task}")

@@ -8,10 +8,10 @@ from typing import Any
 
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_not_input, make_folder, read_text, written
-from modsoft.study import figures, measure, tables
+from modsoft.study import figures, measurements, tables
 from modsoft.study.cells import table
-from modsoft.study.folder import Folder
-from modsoft.study.measure import Record
+from modsoft.study.measurements import Record
+from modsoft.study.paths import Folder
 
 HOW_TO_READ = """\
 Errors of control are distances of the reached unit vector from the desired one, in percent of its length, the
@@ -53,14 +53,14 @@ knows the tasks."""
 def write(folder: Folder) -> None:
     """Writes report.md; `ModelError` where there are no results."""
     check_not_input(folder.report, folder.results, folder.notes)
-    text = "\n".join(lines(measure.load(folder.results), _notes(folder))) + "\n"
+    text = "\n".join(lines(measurements.load(folder.results), _notes(folder))) + "\n"
     with written(folder.report) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def publish(study: Folder, to: Folder) -> None:
     """Copies what people read of a study, its numbers and figures; runs, models and data stay where they are."""
-    measure.load(study.results)
+    measurements.load(study.results)
     make_folder(to.figures)
     pictures = [study.figures / f"{name}.png" for name in figures.CAPTIONS]
     missing = [picture.name for picture in pictures if not picture.is_file()]

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from modsoft.study import paper
 from modsoft.study.cells import Cell, cell, mark, pick, ratio, table
-from modsoft.study.disturb import WORDS
-from modsoft.study.measure import CONTROL, COVERED, ESTIMATION, TIP_DISTANCE, TIP_TILT, Record
+from modsoft.study.measurements import CONTROL, COVERED, ESTIMATION, TIP_DISTANCE, TIP_TILT, Record
+from modsoft.study.perturbations import WORDS
 from modsoft.study.plan import CORRECTIONS, MAIN, SPLITS, TASKS
 
 NETWORK_WORDS = {"module-lstm": "four LSTM", "lstm": "LSTM", "bilstm": "biLSTM"}

@@ -1,0 +1,52 @@
+"""Whether a board is set up for a robot file: everything that can be compared before a valve moves."""
+
+from __future__ import annotations
+
+from modsoft.runtime.board.protocol import Hello, to_bar, to_units
+from modsoft.runtime.errors import ProtocolMismatch, RobotFileError
+from modsoft.runtime.robot import Robot
+
+LONGEST_STEP = 1.5  # periods between two commands of a loop that misses none: one in time, the next half a period late
+
+
+def check_board(hello: Hello, robot: Robot, name: str) -> int:
+    """Return the mask of the valve channels that the robot uses; bit c stands for channel c.
+
+    name: the board's port, for messages. Raises `ProtocolMismatch` where valve full scale, pressure range, slew,
+    control time-out or channels of board and robot file do not go together, `RobotFileError` for a robot without
+    valves.
+    """
+    valve = robot.valve
+    if valve is None:
+        raise RobotFileError(f"robot {robot.name} has no valves, so there is nothing to run on a board")
+    checks = (
+        ("valve full scale", hello.p_full, valve.full_scale_bar, "P_FULL", "full_scale_bar"),
+        ("smallest pressure", hello.p_min, valve.p_min_bar, "P_MIN", "p_min_bar"),
+        ("largest pressure", hello.p_max, valve.p_max_bar, "P_MAX", "p_max_bar"),
+    )
+    for what, board_units, robot_bar, constant, key in checks:
+        if board_units != to_units(robot_bar):
+            raise ProtocolMismatch(
+                f"{what}: the board at {name} has {to_bar(board_units):g} bar, the robot file {robot_bar:g}; "
+                f"correct {constant} in firmware/limits.h and flash it, or {key} in the robot file"
+            )
+    if hello.slew > to_units(robot.limits.slew_bar_per_s):
+        raise ProtocolMismatch(
+            f"the board at {name} moves pressures at {to_bar(hello.slew):g} bar/s, the robot file allows "
+            f"{robot.limits.slew_bar_per_s:g}; correct SLEW in firmware/limits.h and flash it, or slew_bar_per_s"
+        )
+    longest_s = hello.control_timeout_ms / 1000
+    if longest_s <= LONGEST_STEP * robot.loop.period_s:
+        raise ProtocolMismatch(
+            f"the board at {name} vents when no control step comes for {longest_s:g} s, and at {robot.loop.hz:g} Hz up "
+            f"to {LONGEST_STEP * robot.loop.period_s:g} s may lie between two; raise hz under [loop] in the robot "
+            "file, or CONTROL_TIMEOUT_MS in firmware/limits.h"
+        )
+    for chamber in robot.chambers:
+        if chamber.channel >= hello.channels:
+            raise ProtocolMismatch(
+                f"the robot file puts module {chamber.module} side {chamber.side} on channel {chamber.channel}, "
+                f"the board at {name} has channels 0 to {hello.channels - 1}; correct [[chambers]] or "
+                "CHANNELS_USED in firmware/pins.h"
+            )
+    return sum(1 << chamber.channel for chamber in robot.chambers)

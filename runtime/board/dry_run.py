@@ -1,0 +1,32 @@
+"""What stands in for the board in a dry run: set-points go nowhere, and nothing is said to be vented."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime.board.protocol import CHANNELS, Status
+
+Array = NDArray[np.float64]
+
+
+class Rehearsal:
+    """No valve moves; everything else of the loop is as in a run."""
+
+    status: Status | None = None
+    status_age_s = float("nan")
+    ack_latency_s: float | None = None
+
+    def __init__(self) -> None:
+        self.applied_bar: Array = np.full(CHANNELS, np.nan)
+        self.measured_bar: Array = np.full(CHANNELS, np.nan)
+        self.statistics: dict[str, int] = {}
+
+    def check(self) -> None:
+        """Nothing can be lost."""
+
+    def set_pressures(self, tick: int, pressures_bar: Array) -> int:
+        return tick & 0xFF
+
+    def beat(self, tick: int) -> None:
+        """Nobody listens."""

@@ -1,0 +1,135 @@
+"""The tasks: desired configurations over the control steps, from the paper's supplement (S1 to S5).
+
+The supplement prints 3.24 degrees for `down` with two modules, which contradicts its own text ("about 30 degrees",
+angles that sum to zero); 32.4 is taken.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime.control import task_tables
+from modsoft.runtime.control.features import from_angles_deg
+from modsoft.runtime.control.task_tables import Bend
+from modsoft.runtime.errors import UsageError
+from modsoft.runtime.files import NOT_AN_ARRAY
+from modsoft.runtime.robot import Robot
+
+Array = NDArray[np.float64]
+
+SIMULATED_STEPS = 250
+REAL_STEPS = 200
+
+# Largest angles of the planar tasks, degrees.
+EDGE_DEG = {3: [5.4, 18.0, 90.0], 2: [21.6, 72.0]}
+DOWN_DEG = {3: [3.6, 36.0, -39.6], 2: [32.4, -32.4]}
+
+
+def _turn(phase: Array, v_z: Array, sign: Array) -> Array:
+    """Configurations (steps, N, 3) turning about z: phase (steps,) rad, v_z (steps, N), sign (N,)."""
+    side = sign * np.sqrt(1.0 - v_z**2)
+    return np.stack([np.sin(phase)[:, None] * side, np.cos(phase)[:, None] * side, v_z], axis=-1)
+
+
+def task_a(least: Bend) -> Array:
+    """S1: all modules turn once while they bend ever further."""
+    t = np.arange(SIMULATED_STEPS) / SIMULATED_STEPS
+    return _turn(2 * np.pi * t, 1.0 - (1.0 - least.v_z) * t[:, None], least.sign)
+
+
+def task_b(held: Bend) -> Array:
+    """S2: one turn at constant bend; the first step is a jump from rest."""
+    t = np.arange(SIMULATED_STEPS) / SIMULATED_STEPS
+    return _turn(2 * np.pi * t, np.broadcast_to(held.v_z, (SIMULATED_STEPS, len(held.v_z))), held.sign)
+
+
+def task_c(least: Bend) -> Array:
+    """S3, S4: 50 steps of bending in y, then one turn."""
+    t = np.arange(SIMULATED_STEPS)
+    v_z = 1.0 - (1.0 - least.v_z) * np.minimum(t / 50, 1.0)[:, None]
+    return _turn(2 * np.pi * np.maximum(t - 50, 0) / 200, v_z, least.sign)
+
+
+def task_planar(largest_deg: list[float]) -> Array:
+    """S5: every angle rises to its largest value, crosses to the opposite one, and comes back."""
+    t = np.arange(REAL_STEPS)
+    share = np.where(t < 50, t / 50, np.where(t < 150, 2 - t / 50, t / 50 - 4))
+    return from_angles_deg(share[:, None] * np.asarray(largest_deg))
+
+
+def ahead(desired: Array) -> Array:
+    """What the network is asked for at each step (K, N, 3): S_d of eq. (1) is the state at the end of the period, which
+    is desired at the start of the next. The last period ends where the task does."""
+    return np.concatenate([desired[1:], desired[-1:]])
+
+
+def available(kind: str, modules: int) -> list[str]:
+    """Names of the tasks for such a robot. Those of a cable robot that the paper does not have are like the paper's."""
+    if kind == "cable":
+        return ["A", "B", "C"]
+    return ["edge", "down"] if modules in EDGE_DEG else []
+
+
+def task(name: str, kind: str, modules: int) -> Array:
+    """Desired configurations (steps, N, 3), [v_x, v_y, v_z]; row k is the target at the start of control step k."""
+    if name not in available(kind, modules):
+        known = ", ".join(available(kind, modules)) or "none by name"
+        raise UsageError(
+            f"no task {name!r} for a {kind} robot of {modules} modules; known: {known}; or give a .npy file with "
+            f"desired configurations (steps, {modules}, 3), [v_x, v_y, v_z]"
+        )
+    match name:
+        case "A":
+            return task_a(task_tables.spiral(modules))
+        case "B":
+            return task_b(task_tables.circle(modules))
+        case "C":
+            return task_c(task_tables.bend(modules))
+        case "edge":
+            return task_planar(EDGE_DEG[modules])
+        case _:
+            return task_planar(DOWN_DEG[modules])
+
+
+def task_of(robot: Robot, folder: Path) -> str:
+    """The task under [loop], as `load_task` takes it; `folder`: where the robot file's paths start from."""
+    task = robot.loop.task
+    return str(folder / task) if _is_file_name(task) else task
+
+
+def _is_file_name(task: str) -> bool:
+    return task.lower().endswith(".npy")
+
+
+def load_task(name_or_file: str, robot: Robot) -> Array:
+    """A task by its name, or from a .npy file of unit vectors (steps, N, 3)."""
+    if not _is_file_name(name_or_file):
+        return task(name_or_file, robot.robot.kind, robot.modules)
+    if Path(name_or_file).is_dir():
+        raise UsageError(f"task file {name_or_file} is a folder; give an existing .npy file or a task's name")
+    if not Path(name_or_file).is_file():
+        raise UsageError(f"no task file {name_or_file!r}; give an existing .npy file or a task's name")
+    try:
+        desired = np.load(name_or_file, allow_pickle=False)
+    except OSError as error:
+        raise UsageError(f"task file {name_or_file}: cannot be read ({error.strerror or error})") from error
+    except NOT_AN_ARRAY as error:
+        # Without numpy's own words: they advise to load the file unsafely.
+        raise UsageError(
+            f"task file {name_or_file}: not a readable .npy array of floats: damaged, or of another format; "
+            "write it again with numpy.save"
+        ) from error
+    if not isinstance(desired, np.ndarray):
+        raise UsageError(f"task file {name_or_file}: an archive of arrays (.npz); write one array with numpy.save")
+    if desired.ndim != 3 or desired.shape[1:] != (robot.modules, 3):
+        raise UsageError(
+            f"task file {name_or_file}: found shape {desired.shape}, expected (steps, {robot.modules}, 3)"
+        )
+    if not len(desired):
+        raise UsageError(f"task file {name_or_file}: found 0 steps, expected at least 1")
+    if desired.dtype.kind != "f" or not np.allclose(np.linalg.norm(desired, axis=-1), 1.0, atol=1e-6):
+        raise UsageError(f"task file {name_or_file}: every [v_x, v_y, v_z] must be a unit vector of floats")
+    return desired.astype(np.float64)

@@ -1,0 +1,135 @@
+"""The tasks of the supplement."""
+
+import numpy as np
+import pytest
+
+from modsoft.runtime import robot
+from modsoft.runtime.control import features, task_tables, tasks
+from modsoft.runtime.errors import UsageError
+
+
+@pytest.mark.parametrize(
+    ("kind", "modules"),
+    [*(("cable", modules) for modules in (2, 3, 4, 5, 6, 8, 12, 64)), ("pneumatic", 2), ("pneumatic", 3)],
+)
+def test_every_task_is_a_row_of_unit_vectors(kind, modules):
+    for name in tasks.available(kind, modules):
+        desired = tasks.task(name, kind, modules)
+        assert desired.shape == (250 if kind == "cable" else 200, modules, 3)
+        np.testing.assert_allclose(np.linalg.norm(desired, axis=-1), 1.0, atol=1e-12)
+
+
+def test_task_a_starts_straight_and_keeps_bending():
+    desired = tasks.task("A", "cable", 4)
+    np.testing.assert_allclose(desired[0], [[0, 0, 1]] * 4, atol=1e-12)
+    np.testing.assert_allclose(desired[125, 3], [0.0, -np.sqrt(1 - 0.8125**2), 0.8125], atol=1e-12)
+
+
+def test_task_b_holds_v_z_and_the_tip_turns_against_the_others():
+    desired = tasks.task("B", "cable", 4)
+    np.testing.assert_allclose(desired[:, :, 2], np.broadcast_to([0.998, 0.998, 0.996, 0.6], (250, 4)))
+    assert np.sign(desired[0, :, 1]).tolist() == [1, 1, 1, -1]
+
+
+def test_task_c_bends_in_y_then_turns():
+    desired = tasks.task("C", "cable", 6)
+    np.testing.assert_allclose(desired[:51, :, 0], 0, atol=1e-12)
+    np.testing.assert_allclose(desired[50, :, 2], [0.999, 0.996, 0.985, 0.975, 0.925, 0.600])
+    np.testing.assert_allclose(desired[100, 5, 0], -0.8, atol=1e-12)  # a quarter turn, a = -1
+
+
+def angles_deg(bend):
+    return np.degrees(bend.sign * np.arccos(bend.v_z))
+
+
+def test_the_papers_robots_have_the_papers_tables():
+    for modules in (4, 6):
+        assert task_tables.spiral(modules).v_z.tolist() == task_tables.SPIRAL_V_Z[modules]
+        for made, v_z, sign in [
+            (task_tables.circle(modules), task_tables.CIRCLE_V_Z, task_tables.CIRCLE_SIGN),
+            (task_tables.bend(modules), task_tables.BEND_V_Z, task_tables.BEND_SIGN),
+        ]:
+            assert (made.v_z.tolist(), made.sign.tolist()) == (v_z[modules], sign[modules])
+
+
+@pytest.mark.parametrize("modules", [2, 3, 5, 7, 8, 12])
+def test_tasks_of_other_robots_are_of_the_papers_shape(modules):
+    spiral, circle, bend = (angles_deg(make(modules)) for make in
+                            (task_tables.spiral, task_tables.circle, task_tables.bend))  # fmt: skip
+    assert all(np.abs(each).max() < 53.2 for each in (spiral, circle, bend))  # what the paper asks of a module
+    assert (np.diff(spiral) >= 0).all()
+    if modules > 4:
+        assert 139 < spiral.sum() < 170
+    assert bend.sum() == pytest.approx(0.0, abs=1e-9)
+    assert (bend < 0).tolist() == [False] * (modules - 1) + [True]
+    backward = 1 if modules < 6 else 2
+    assert (circle < 0).tolist() == [False] * (modules - backward) + [True] * backward
+    assert 11 < circle[circle > 0].sum() < 13
+    assert -54 < circle[circle < 0].sum() < -50
+
+
+@pytest.mark.parametrize("modules", [2, 3, 5, 8, 12])
+def test_the_tip_stays_near_the_axis_in_task_b_and_upright_in_task_c(modules):
+    """Modules as arcs of equal length in one plane: as far from the axis as the paper's robots, over the length, or
+    little farther."""
+    ends_rad = np.radians(np.cumsum(angles_deg(task_tables.circle(modules))))
+    starts_rad = np.concatenate([[0.0], ends_rad[:-1]])
+    aside = (np.cos(starts_rad) - np.cos(ends_rad)) / (ends_rad - starts_rad)
+    assert abs(aside.sum() / modules) < 0.08
+    assert abs(angles_deg(task_tables.bend(modules)).sum()) < 1e-9
+
+
+@pytest.mark.parametrize(("modules", "largest"), [(3, [3.6, 36.0, -39.6]), (2, [32.4, -32.4])])
+def test_down_is_the_triangle_of_s5(modules, largest):
+    angles = features.bending_angle_deg(tasks.task("down", "pneumatic", modules))
+    for step, share in [(0, 0), (25, 0.5), (50, 1), (100, 0), (150, -1), (175, -0.5)]:
+        np.testing.assert_allclose(angles[step], share * np.array(largest), atol=1e-9)
+    np.testing.assert_allclose(angles.sum(axis=1), 0, atol=1e-9)
+
+
+def test_unknown_task_names_the_known_ones():
+    with pytest.raises(UsageError, match="edge, down"):
+        tasks.load_task("sideways", robot.load("pneumatic-3"))
+
+
+def test_task_from_a_file(tmp_path):
+    path = tmp_path / "task.npy"
+    np.save(path, tasks.task("edge", "pneumatic", 2))
+    loaded = tasks.load_task(str(path), robot.load("pneumatic-2"))
+    assert np.array_equal(loaded, tasks.task("edge", "pneumatic", 2))
+    with pytest.raises(UsageError, match=r"expected \(steps, 3, 3\)"):
+        tasks.load_task(str(path), robot.load("pneumatic-3"))
+
+
+@pytest.mark.parametrize("content", [np.zeros((5, 2, 3)), np.ones((5, 2, 3), dtype=int), np.full((5, 2, 3), np.nan)])
+def test_task_file_of_no_unit_vectors_is_refused(tmp_path, content):
+    np.save(tmp_path / "task.npy", content)
+    with pytest.raises(UsageError, match="unit vector"):
+        tasks.load_task(str(tmp_path / "task.npy"), robot.load("pneumatic-2"))
+
+
+def test_task_file_missing_or_damaged(tmp_path):
+    with pytest.raises(UsageError, match="no task file"):
+        tasks.load_task(str(tmp_path / "none.npy"), robot.load("pneumatic-2"))
+    (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY broken")
+    with pytest.raises(UsageError, match="not a readable"):
+        tasks.load_task(str(tmp_path / "bad.npy"), robot.load("pneumatic-2"))
+    np.save(tmp_path / "objects.npy", np.array([None]), allow_pickle=True)
+    (tmp_path / "empty.npy").write_bytes(b"")
+    for name in ("bad.npy", "objects.npy", "empty.npy"):
+        with pytest.raises(UsageError, match=r"not a readable .* numpy\.save") as caught:
+            tasks.load_task(str(tmp_path / name), robot.load("pneumatic-2"))
+        assert "pickle" not in str(caught.value)
+    (tmp_path / "folder.npy").mkdir()
+    with pytest.raises(UsageError, match="is a folder"):
+        tasks.load_task(str(tmp_path / "folder.npy"), robot.load("pneumatic-2"))
+
+
+def test_task_file_without_a_step_and_archives(tmp_path):
+    np.save(tmp_path / "none.npy", np.zeros((0, 2, 3)))
+    with pytest.raises(UsageError, match="found 0 steps, expected at least 1"):
+        tasks.load_task(str(tmp_path / "none.npy"), robot.load("pneumatic-2"))
+    with (tmp_path / "many.npy").open("wb") as file:
+        np.savez(file, a=np.zeros((1, 2, 3)))
+    with pytest.raises(UsageError, match="archive of arrays"):
+        tasks.load_task(str(tmp_path / "many.npy"), robot.load("pneumatic-2"))

@@ -1,0 +1,317 @@
+"""Builds, starts and talks to the emulated board.
+
+Two boards with one interface: `simavr` runs the compiled firmware on an emulated ATmega2560 behind the MEGA's real
+bootloader; `native` runs the firmware's logic compiled for this machine, for machines without simavr, and shows no
+bootloader, timer register or CPU time. Commands and events are described at the top of `tools/hil/board/board.c`.
+
+simavr is GPL-3; what is linked with it here is a test tool, is built on the spot, and is not part of the wheel.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Literal
+
+import msgspec
+
+from modsoft.runtime import process
+from modsoft.runtime.errors import DeviceAbsent
+
+Event = dict[str, Any]
+BoardName = Literal["simavr", "native"]
+
+ROOT = Path(__file__).resolve().parents[3]
+SOURCES = ROOT / "tools" / "hil" / "board"
+FIRMWARE = ROOT / "firmware"
+
+BUILD = ROOT / "build"
+if not process.is_writable(BUILD):  # a checkout that belongs to another user
+    BUILD = process.temporary_folder() / "build"
+FIRMWARE_ELF = BUILD / "firmware" / "modsoft.elf"
+BOOTLOADER = Path(
+    "/usr/share/arduino/hardware/arduino/avr/bootloaders/stk500v2/stk500boot_v2_mega2560.hex"
+)  # of Debian's arduino-core-avr
+
+DEBIAN_PACKAGES = {
+    "gcc": "gcc",
+    "make": "make",
+    "avr-gcc": "gcc-avr",
+    "/usr/lib/avr/include/avr/iom2560.h": "avr-libc",
+    "/usr/include/simavr/sim_avr.h": "libsimavr-dev",
+    str(BOOTLOADER): "arduino-core-avr",
+}
+_NEEDS: dict[BoardName, tuple[str, ...]] = {"simavr": tuple(DEBIAN_PACKAGES), "native": ("gcc",)}
+_COMMON = ("harness.c", "events.c", "line.c")
+_BOARD_SOURCES: dict[BoardName, tuple[Path, ...]] = {
+    "simavr": tuple(SOURCES / name for name in (*_COMMON, "board.c", "board_outputs.c", "board_uart.c")),
+    "native": (
+        *(SOURCES / name for name in (*_COMMON, "native_board.c")),
+        *(FIRMWARE / name for name in ("frame.c", "output.c", "controller.c")),
+    ),
+}
+_COMPILE = ("gcc", "-O2", "-g", "-std=gnu11", "-Wall", "-Wextra", f"-I{SOURCES}", f"-I{FIRMWARE}")
+_LINK = {
+    # avr-libc's headers come last: of them only the register names are wanted.
+    "simavr": (
+        "-isystem/usr/include/simavr", "-idirafter/usr/lib/avr/include",
+        "-l:libsimavr.a", "-l:libelf.so.1", "-lutil", "-lpthread", "-lm",
+    ),
+    "native": ("-lm",),
+}  # fmt: skip
+START_TIMEOUT_S = 10.0
+RUN_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 3.0
+
+
+def missing_packages(board: BoardName) -> list[str]:
+    """Return the Debian packages that `board` still needs on this machine, in the order of `DEBIAN_PACKAGES`."""
+    there = {need: Path(need).exists() if need.startswith("/") else bool(shutil.which(need)) for need in _NEEDS[board]}
+    return [DEBIAN_PACKAGES[need] for need, found in there.items() if not found]
+
+
+def choose(board: str = "auto") -> BoardName:
+    """Return the board to run; `auto` is simavr where it can be had, else native. `DeviceAbsent` names the packages."""
+    names: dict[str, BoardName] = {"simavr": "simavr", "native": "native"}
+    if board == "auto":
+        return "simavr" if not missing_packages("simavr") else "native"
+    if board not in names:
+        raise DeviceAbsent(f"no emulated board is called {board!r}: there are simavr, native and auto")
+    return names[board]
+
+
+def build(board: BoardName, *, firmware: bool = True) -> Path:
+    """Compile the board (and the firmware for simavr) where it is older than its sources; return the program.
+
+    `DeviceAbsent` where a compiler or a library is missing, with the packages to install, or where the compiler fails.
+    """
+    if not (SOURCES / "board.c").exists():
+        raise DeviceAbsent("the emulated board is built from its sources: run this from a clone of the repository")
+    if missing := missing_packages(board):
+        raise DeviceAbsent(f"the {board} board needs Debian packages: sudo apt install {' '.join(missing)}")
+    folder = BUILD / "hil"
+    folder.mkdir(parents=True, exist_ok=True)
+    program = folder / f"{board}_board"
+    with (folder / f"{board}.lock").open("w") as lock:  # several test runs may want it at once
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if board == "simavr" and firmware:
+            out = os.path.relpath(FIRMWARE_ELF.parent, FIRMWARE)
+            _run(("make", "-s", "-C", str(FIRMWARE), f"OUT={out}"), "the firmware does not build")
+        sources = _BOARD_SOURCES[board]
+        headers = (*SOURCES.glob("*.h"), *FIRMWARE.glob("*.h"))
+        newest = max(path.stat().st_mtime for path in (*sources, *headers))
+        if not program.exists() or program.stat().st_mtime < newest:
+            fresh = program.with_suffix(".new")
+            _run((*_COMPILE, *map(str, sources), "-o", str(fresh), *_LINK[board]), f"the {board} board does not build")
+            fresh.rename(program)
+    return program
+
+
+def _run(command: tuple[str, ...], complaint: str) -> None:
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode != 0:
+        lines = [line for line in (result.stderr + result.stdout).splitlines() if "error" in line.lower()]
+        raise DeviceAbsent(f"{complaint}: {(lines or [result.stderr.strip()[-200:]])[0]}")
+
+
+def is_event(name: str, **values: Any) -> Callable[[Event], bool]:
+    """A predicate for `EmulatedBoard.wait_for`: events of this name with these values."""
+    return lambda event: event["event"] == name and all(event.get(key) == value for key, value in values.items())
+
+
+def end(process: subprocess.Popen[bytes], sending: threading.Lock) -> None:
+    """End a process by the end of its input, or by force. `sending` is held by whoever writes to it.
+
+    One that hangs with a full pipe blocks its writer, who keeps the lock: that one is killed without it.
+    """
+    assert process.stdin is not None
+    if sending.acquire(timeout=STOP_TIMEOUT_S):
+        try:
+            with contextlib.suppress(BrokenPipeError):  # of what was not written yet
+                process.stdin.close()
+        finally:
+            sending.release()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(STOP_TIMEOUT_S)
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+    with sending, contextlib.suppress(BrokenPipeError):
+        process.stdin.close()
+
+
+class EmulatedBoard:
+    """An emulated MEGA in a process of its own, used as a context manager.
+
+    Every event is kept in `trace` (dicts with at least `event`, `t_us` in emulated microseconds, `mono_ns` in
+    CLOCK_MONOTONIC nanoseconds); `on_event`, if given, is called for each from the reading thread and must be quick.
+    Ends when the context does, and when this process dies in whatever way: the board sees the end of its input.
+    """
+
+    def __init__(
+        self,
+        board: str = "auto",
+        *,
+        firmware: Path | None = None,
+        bootloader: bool = True,
+        port_link: Path | None = None,
+        fast: bool = False,
+        stepped: bool = False,
+        on_event: Callable[[Event], None] | None = None,
+    ) -> None:
+        """Prepare a board; nothing is built or started before `start`.
+
+        firmware: an ELF or Intel hex file; the project's own, freshly built, where it is None. simavr only.
+        bootloader: run behind the MEGA's real bootloader, as a board from the shop does. simavr only.
+        port_link: where the link to the serial port goes; a temporary folder where it is None.
+        fast: run as fast as it can. The board's time-outs then fire early for a host in real time: only emulated
+        times (`t_us`) are worth anything.
+        stepped: its time stands still but for `run`; see `modsoft.hil.stepped`.
+        """
+        self.board = choose(board)
+        self._firmware = firmware
+        self._bootloader = bootloader
+        self._folder = None if port_link else tempfile.TemporaryDirectory(prefix="modsoft-board-")
+        self._link = Path(self._folder.name) / "ttyMEGA" if self._folder else port_link
+        self._pace = ["--fast"] * fast + ["--stepped"] * stepped
+        self._on_event = on_event
+        self._process: subprocess.Popen[bytes] | None = None
+        self._complaint = ""
+        self._sending = threading.Lock()
+        self._changed = threading.Condition()
+        self._duties: list[float] = []
+        self.trace: list[Event] = []
+        self.ready: Event = {}
+        self.ran: Event = {"t_us": 0.0, "from_host": 0, "to_host": 0}  # the last `run`; stepped only
+        self.summary: Event = {}
+
+    @property
+    def port(self) -> str:
+        """The path to give to the host as its serial port. It is not there while unplugged."""
+        return str(self._link)
+
+    @property
+    def clock(self) -> str:
+        """In which clock the board's time-outs ran, for the report."""
+        return str(self.ready["clock"])
+
+    @property
+    def pid(self) -> int:
+        """Process id of the board."""
+        return int(self.ready["pid"])
+
+    def start(self) -> EmulatedBoard:
+        """Build what is missing and start; return when the serial port is there. `DeviceAbsent` where it cannot."""
+        program = build(self.board, firmware=self._firmware is None)
+        command = [str(program), "--port-link", str(self._link)]
+        if self.board == "simavr":
+            command += ["--elf", str(self._firmware or FIRMWARE_ELF)]
+            command += ["--bootloader", str(BOOTLOADER)] if self._bootloader else []
+        command += self._pace
+        self._stderr = tempfile.TemporaryFile()
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, start_new_session=True
+        )  # a Ctrl-C at the terminal is for the host; the board goes when it is told to
+        self._reader = threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True)
+        self._reader.start()
+        try:
+            self.ready = self.wait_for(is_event("ready"), START_TIMEOUT_S)
+        except TimeoutError:
+            self.stop()
+            raise DeviceAbsent(f"the {self.board} board did not start: {self._complaint}") from None
+        return self
+
+    def send(self, command: str) -> None:
+        """Give the board one command; see the top of board.c. `DeviceAbsent` if it is gone."""
+        process = self._process
+        if process is None or process.stdin is None:
+            raise DeviceAbsent(f"the {self.board} board is not running")
+        try:
+            with self._sending:
+                process.stdin.write(command.encode() + b"\n")
+                process.stdin.flush()
+        except BrokenPipeError:
+            raise DeviceAbsent(f"the {self.board} board has ended") from None
+
+    def run(self, microseconds: int, from_host: int) -> Event:
+        """Stepped: let so much time pass, as soon as so many bytes in all came from the host."""
+        since = len(self.trace)
+        self.send(f"run {microseconds} {from_host}")
+        self.ran = self.wait_for(is_event("ran"), RUN_TIMEOUT_S, since)
+        return self.ran
+
+    def duties(self) -> list[float]:
+        """The effective duty of each channel now, 0 to 1, in the order of firmware/pins.h."""
+        with self._changed:
+            return list(self._duties)
+
+    def millivolt(self, pressure_bar: float) -> int:
+        """What a sensor on this board shows at a pressure, for `adc`."""
+        return round(pressure_bar * float(self.ready["sensor_mv_per_bar"]))
+
+    def wait_for(self, predicate: Callable[[Event], bool], timeout_s: float, since: int = 0) -> Event:
+        """Return the first event in `trace[since:]` that the predicate accepts; `TimeoutError` if none comes.
+
+        Take `since = len(board.trace)` before the cause, so that an effect from before is not taken for the answer.
+        """
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while True:
+                for event in self.trace[since:]:
+                    if predicate(event):
+                        return event
+                since = len(self.trace)
+                left = deadline - time.monotonic()
+                ended = self._process is not None and self._process.poll() is not None and not self._reader.is_alive()
+                if left <= 0 or ended:
+                    raise TimeoutError("the board ended" if ended else f"no such event within {timeout_s} s")
+                self._changed.wait(min(left, 0.2))
+
+    def stop(self) -> Event:
+        """End the board, at once if need be, and return its summary (empty if it gave none)."""
+        process, self._process = self._process, None
+        if process is None or process.stdin is None or process.stdout is None:
+            return self.summary
+        end(process, self._sending)  # end of file: the same way as when this process dies
+        self._reader.join()
+        process.stdout.close()
+        self._stderr.seek(0)
+        lines = self._stderr.read().decode(errors="replace").strip().splitlines()
+        self._complaint = lines[-1] if lines else f"exit code {process.returncode}"
+        self._stderr.close()
+        if self._folder is not None:
+            self._folder.cleanup()
+        self.summary = next((event for event in reversed(self.trace) if event["event"] == "summary"), {})
+        return self.summary
+
+    def _read(self, lines: IO[bytes]) -> None:
+        decode = msgspec.json.Decoder(Event).decode
+        for line in lines:
+            event = decode(line)
+            with self._changed:
+                if event["event"] == "ready":
+                    self._duties += [0.0] * (event["channels"] - len(self._duties))
+                elif event["event"] == "pwm":
+                    self._duties += [0.0] * (event["channel"] + 1 - len(self._duties))
+                    self._duties[event["channel"]] = event["duty"]
+                self.trace.append(event)
+                self._changed.notify_all()
+            if self._on_event is not None:
+                self._on_event(event)
+
+    def __enter__(self) -> EmulatedBoard:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        self.stop()

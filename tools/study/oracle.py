@@ -1,0 +1,56 @@
+"""The floor of every cell: the smallest error that any sequence of actions is known to reach, found on the plant."""
+
+from __future__ import annotations
+
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.study import rollouts
+from modsoft.study.paths import Folder
+from modsoft.study.plan import Plan
+from modsoft.study.scheduler import Stage, Told
+from modsoft.training.simulation.fleet import simulated
+from modsoft.training.simulation.rollout import Flight
+
+STEP_S = 0.35  # of one core, for a control step of four modules, about
+
+Array = NDArray[np.float64]
+
+
+def finding(plan: Plan, folder: Folder, jobs: int) -> Stage:
+    """floors/*.npz, each a run like any other: what the robot does under the best actions found."""
+    missing = [each for each in plan.floors if rollouts.meta(folder.floor(*each)) != identity(plan, *each)]
+    return Stage("floors", missing, partial(_find, plan, folder), partial(find_s, plan))
+
+
+def find_s(plan: Plan, each: tuple[str, int]) -> float:
+    return (plan.steps or 250) * STEP_S * (each[1] / 4) ** 2
+
+
+def identity(plan: Plan, task: str, modules: int) -> dict[str, Any]:
+    steps = len(rollouts.desired_of(plan, task, modules))
+    return {"task": task, "modules": modules, "steps": steps, "seed": 0, "code_version": version("modsoft")}
+
+
+def _find(plan: Plan, folder: Folder, each: tuple[str, int], told: Told) -> None:
+    from modsoft.training.simulation.oracle import floor
+
+    task, modules = each
+    desired = rollouts.desired_of(plan, task, modules)
+    actions, _ = floor("cable", modules, desired, seed=0)
+    rollouts.keep(folder.floor(*each), identity(plan, *each), replay(modules, actions), desired)
+
+
+def replay(modules: int, actions: Array) -> Flight:
+    """What a robot at rest does under actions (K, N, A)."""
+    fleet = simulated("cable", modules, 1)
+    told = [(fleet.configuration[0], fleet.positions[0], fleet.directors[0])]
+    for action in actions:
+        fleet.step(action[None])
+        told.append((fleet.configuration[0], fleet.positions[0], fleet.directors[0]))
+    configuration, positions, directors = (np.stack(values) for values in zip(*told, strict=True))
+    return Flight(configuration, np.asarray(actions), positions, directors)

@@ -1,0 +1,108 @@
+"""The random actions that data are collected with (section 2.2 of the paper), and smooth ones beside them."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime.control.actuation import limited
+from modsoft.runtime.robot import Robot
+
+# varied: smooth, on robots that differ from the drawing (`collect.variation_of`).
+STRATEGIES = ("staged", "random", "smooth", "varied")
+JITTER = (0.003, 0.3)  # of smooth actions, smallest and largest
+KNOTS = (4.0, 60.0)  # steps from one random action to the next on the way of a smooth sequence, quickest and slowest
+OVER = 1.3  # knots are drawn from a range this much larger and cut to it, so that its ends are visited
+
+Array = NDArray[np.float64]
+
+
+def stage_borders(strategy: str, modules: int, steps: int) -> NDArray[np.int64]:
+    """First step of each stage and the end: N stages of equal length where staged, one where random."""
+    stages = modules if strategy == "staged" else 1
+    return np.round(np.linspace(0, steps, stages + 1)).astype(np.int64)
+
+
+def draw_actions(robot: Robot, strategy: str, steps: int, rng: np.random.Generator) -> Array:
+    """Random actions (steps, N, A) in [-1, 1], uniform over the range.
+
+    staged: in stage s = 0..N-1 the first N - s modules share one sequence, every further module has its own (section
+    2.2, for any N); random: every module has its own, always; smooth and varied: as a task would move the robot, which
+    random actions never do.
+
+    Where the robot file bounds the step between two control periods, the sequence is a random walk reflected at the
+    ends of the range: its steps never exceed the bound and in the long run it is exactly uniform, ends included. Each
+    walk changes its pace now and then, so that slow motion is seen as well as fast. It goes on over stage borders,
+    where the bound holds too.
+    """
+    shape = (steps, robot.modules, robot.action_size)
+    largest = robot.limits.largest_actuation_step
+    if strategy in ("smooth", "varied"):
+        return _smooth(robot, steps, rng)
+    drawn = rng.uniform(-1.0, 1.0, shape)
+    if largest < 2.0:
+        drawn *= largest * _paces(shape, rng)
+    if strategy == "staged":
+        borders = stage_borders(strategy, robot.modules, steps)
+        for stage, (begin, end) in enumerate(itertools.pairwise(borders)):
+            alike = robot.modules - stage
+            drawn[begin:end, 1:alike] = drawn[begin:end, :1]
+    return drawn if largest >= 2.0 else _reflected_walk(drawn)
+
+
+def _paces(shape: tuple[int, int, int], rng: np.random.Generator) -> Array:
+    """Share of the largest step in (0, 1] that each walk (steps, N, A) keeps to; changes every 20 steps on average.
+
+    Cubed, so that half of them are below an eighth: tasks move slowly, and friction shows when a robot does.
+    """
+    paces = rng.uniform(0.0, 1.0, shape) ** 3
+    for step, changes in enumerate(rng.uniform(size=shape) < 0.05):
+        if step > 0:
+            paces[step] = np.where(changes, paces[step], paces[step - 1])
+    return paces
+
+
+def _reflected_walk(increments: Array) -> Array:
+    """Sums increments (steps, ...) of at most 2 from 0 and folds the sum back into [-1, 1]."""
+    unfolded = np.cumsum(increments, axis=0) + 1.0
+    return 1.0 - np.abs(unfolded % 4.0 - 2.0)
+
+
+def _smooth(robot: Robot, steps: int, rng: np.random.Generator) -> Array:
+    """Actions (steps, N, A) that wander from knot to knot, with a little jitter: without it the network could not tell
+    what a small change of the action does. Some modules follow one sequence, each with its own gain, others their own;
+    how many is drawn for each episode."""
+    shape = (steps, robot.modules, robot.action_size)
+    shared, follows = _wander(steps, robot.action_size, rng), rng.uniform()
+    actions = np.empty(shape)
+    for module in range(robot.modules):
+        if rng.uniform() < follows:
+            actions[:, module] = shared * rng.uniform(-1.0, 1.0)
+        else:
+            full = rng.uniform() < 0.5
+            actions[:, module] = _wander(steps, robot.action_size, rng) * (1.0 if full else rng.uniform(0.2, 1.0))
+    least, most = np.log(JITTER)
+    jitter = np.exp(rng.uniform(least, most, robot.modules))[:, None]
+    actions = np.clip(actions + jitter * rng.uniform(-1.0, 1.0, shape), -1.0, 1.0)
+    previous = np.zeros(shape[1:])
+    for step in range(steps):
+        previous = actions[step] = limited(actions[step], previous, robot.limits.largest_actuation_step)
+    return actions
+
+
+def _wander(steps: int, action_size: int, rng: np.random.Generator) -> Array:
+    """One sequence (steps, A) from knot to knot along cosines; one in two begins with a jump from rest."""
+    pace = np.exp(rng.uniform(*np.log(KNOTS)))
+    knots = [0.0]
+    while knots[-1] <= steps:
+        knots.append(knots[-1] + max(2.0, pace * np.exp(rng.normal(0.0, 0.4))))
+    values = np.clip(rng.uniform(-OVER, OVER, (len(knots), action_size)), -1.0, 1.0)
+    if rng.uniform() < 0.5:
+        values[0] = 0.0
+    at = np.arange(steps)
+    before = np.searchsorted(knots, at, side="right") - 1
+    share = (at - np.take(knots, before)) / np.diff(knots)[before]
+    share = (0.5 - 0.5 * np.cos(np.pi * share))[:, None]
+    return values[before] * (1.0 - share) + values[before + 1] * share

@@ -1,0 +1,229 @@
+"""The data set: one HDF5 file of episodes, and the windows that a network learns from.
+
+    configuration   (E, K + 1, N, 3) [v_x, v_y, v_z], row 0 at rest, row t + 1 reached by the action of row t
+    action          (E, K, N, A) in [-1, 1]
+
+Attributes: `schema` (1), `recipe` (JSON; all that the numbers depend on: at least `robot`, the robot file as plain
+values, and `strategy`, text), `stage_borders` (stages + 1 steps, 0 to K), `redrawn` (episodes that were not finite and
+were drawn again). What a data set means is checked when it is read: `dataset_checks`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.control.features import episode_features, state_of
+from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import check_is_file, written
+from modsoft.runtime.robot import Robot
+from modsoft.training.data import dataset_checks as checks
+from modsoft.training.data.hdf5 import own_array
+
+SCHEMA = 1
+# Shares of training, validation and test, as in the paper (70/10/20); these are where the second and third begin.
+VALIDATION_FROM, TEST_FROM = 0.7, 0.8
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """Episodes of one robot, all of the same length and each from rest."""
+
+    recipe: dict[str, Any]  # schema, robot, strategy, seed, steps, period_s, plant_sha256, code_version
+    configuration: Array  # (E, K + 1, N, 3)
+    action: Array  # (E, K, N, A)
+    stage_borders: NDArray[np.int64]  # (stages + 1,), 0 to K
+    redrawn: int
+
+    @property
+    def robot(self) -> Robot:
+        return robots.from_dict(self.recipe["robot"], "data set")
+
+    @property
+    def samples(self) -> int:
+        """Control steps in all episodes."""
+        return self.action.shape[0] * self.action.shape[1]
+
+    def sha256(self) -> str:
+        """Of recipe and numbers, so that a model can say what it was trained on."""
+        digest = hashlib.sha256(json.dumps(self.recipe, sort_keys=True).encode())
+        for array in (self.configuration, self.action, self.stage_borders):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+
+class Episode(NamedTuple):
+    """One run of the robot from rest."""
+
+    configuration: Array  # (K + 1, N, 3)
+    action: Array  # (K, N, A)
+    redrawn: int = 0  # how often it had been drawn before without staying finite
+
+    def is_finite(self) -> bool:
+        return bool(np.isfinite(self.configuration).all() and np.isfinite(self.action).all())
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a data set says about itself without its numbers."""
+
+    recipe: dict[str, Any]
+    stage_borders: NDArray[np.int64]
+    redrawn: int
+    episodes: int
+
+    @property
+    def samples(self) -> int:
+        """Control steps in all episodes."""
+        return self.episodes * int(self.stage_borders[-1])
+
+
+def write(data: DataSet, path: Path) -> None:
+    """Writes beside `path` and renames. The same data give the same bytes."""
+    redrawn = itertools.chain([data.redrawn], itertools.repeat(0))
+    episodes = map(Episode, data.configuration, data.action, redrawn)
+    join(path, data.recipe, data.stage_borders, len(data.action), episodes)
+
+
+def join(
+    path: Path, recipe: dict[str, Any], stage_borders: NDArray[np.int64], count: int, episodes: Iterable[Episode]
+) -> Header:
+    """`write` for `count` episodes that come one after the other and are never in memory together."""
+    redrawn = 0
+    with written(path) as temporary:
+        try:
+            with h5py.File(temporary, "w") as file:
+                for index, episode in enumerate(episodes):
+                    if index == 0:
+                        for name in ("configuration", "action"):
+                            file.create_dataset(name, (count, *getattr(episode, name).shape), np.float64)
+                    if not episode.is_finite():  # the last door: none may get here
+                        raise ModelError(f"episode {index} is not finite; not written to {path}")
+                    file["configuration"][index] = episode.configuration
+                    file["action"][index] = episode.action
+                    redrawn += episode.redrawn
+                file.attrs["schema"] = SCHEMA
+                file.attrs["recipe"] = json.dumps(recipe, sort_keys=True)
+                file.attrs["stage_borders"] = stage_borders
+                file.attrs["redrawn"] = redrawn
+        except RuntimeError as error:  # what h5py makes of a disk that is full when it closes the file
+            raise OSError(" ".join(str(error).split())) from error
+    return Header(recipe, stage_borders, redrawn, count)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[dict[str, h5py.Dataset], Header]]:
+    """The arrays of a data set, not read yet, and what it reports about itself, checked against their shapes."""
+    check_is_file(path, "data set", f"modsoft-collect --out {path} makes one")
+    try:
+        with h5py.File(path, "r") as file:
+            told = checks.attributes(file.attrs, path)
+            schema = checks.whole_number("schema", told["schema"], path)
+            if schema != SCHEMA:
+                raise ModelError(f"{path}: schema {schema}, this version reads {SCHEMA}; collect it again")
+            arrays = {name: own_array(file, name) for name in ("configuration", "action")}
+            shape = arrays["action"].shape
+            steps = shape[1] if len(shape) == 4 else 0
+            recipe = checks.recipe(told["recipe"], steps, path)
+            robot = robots.from_dict(recipe["robot"], "data set")
+            checks.shapes(arrays["configuration"].shape, shape, robot, path)
+            borders = checks.stage_borders(told["stage_borders"], steps, path)
+            redrawn = checks.whole_number("redrawn", told["redrawn"], path)
+            yield arrays, Header(recipe, borders, redrawn, episodes=shape[0])
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise ModelError(f"{path}: not a data set of modsoft-collect, or damaged ({error})") from error
+
+
+def read_header(path: Path) -> Header:
+    """Reads what a data set reports about itself; errors as in `read`."""
+    with _opened(path) as (_, header):
+        return header
+
+
+def read(path: Path) -> DataSet:
+    """Reads a data set of any float type; `ModelError` says what was found where it is none, is damaged, or means
+    something else: configurations that are no unit vectors, actions beyond [-1, 1]."""
+    with _opened(path) as (arrays, header):
+        configuration, action = (np.asarray(arrays[name], np.float64) for name in ("configuration", "action"))
+    checks.configuration(configuration, path)
+    checks.action(action, path)
+    return DataSet(header.recipe, configuration, action, header.stage_borders, header.redrawn)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Samples of one part: features (W, N, F) and the actions (W, N, A) to be estimated, float32."""
+
+    features: NDArray[np.float32]
+    targets: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.targets)
+
+    @staticmethod
+    def joined(parts: Sequence[Windows]) -> Windows:
+        features, targets = ([getattr(part, name) for part in parts] for name in ("features", "targets"))
+        return parts[0] if len(parts) == 1 else Windows(np.concatenate(features), np.concatenate(targets))
+
+    def evenly(self, most: int) -> Windows:
+        """At most `most` of them, spread evenly."""
+        every = -(-len(self) // most)
+        return Windows(self.features[::every], self.targets[::every])
+
+
+def split(data: DataSet, history: int, how: str, seed: int) -> tuple[Windows, Windows, Windows]:
+    """Training, validation and test windows, 70/10/20.
+
+    how: "blocks" cuts contiguous blocks of time and drops every window that reaches over a cut; "shuffled" deals
+    single windows at random as the paper does, which leaks, since neighbouring windows share most of their content.
+    """
+    kind = data.robot.robot.kind
+    states = state_of(data.configuration, kind)
+    features = np.stack([episode_features(s, a, history) for s, a in zip(states, data.action, strict=True)])
+    features, targets = features.astype(np.float32), data.action.astype(np.float32)
+    part = _shuffled_parts(data, seed) if how == "shuffled" else _block_parts(data, history)
+    chosen = [Windows(features[part == p], targets[part == p]) for p in range(3)]
+    empty = [name for name, windows in zip(("training", "validation", "test"), chosen, strict=True) if not len(windows)]
+    if empty:
+        raise ModelError(
+            f"{data.samples} samples leave none for {' and '.join(empty)} at history {history}; collect more"
+        )
+    return chosen[0], chosen[1], chosen[2]
+
+
+def _shuffled_parts(data: DataSet, seed: int) -> NDArray[np.int64]:
+    """Part (E, K) of every window: 0, 1 or 2."""
+    place = np.random.default_rng(seed).permutation(data.samples) / data.samples
+    return np.digitize(place, [VALIDATION_FROM, TEST_FROM]).reshape(data.action.shape[:2])
+
+
+def _block_parts(data: DataSet, history: int) -> NDArray[np.int64]:
+    """Part (E, K) of every window, -1 for those dropped.
+
+    Each stage is cut on its own, all episodes' pieces of it laid end to end: so every part holds every stage in its
+    share, with one long run of a real robot as with many short simulated ones.
+    """
+    episodes, steps = data.action.shape[:2]
+    borders = data.stage_borders
+    stage = np.searchsorted(borders, np.arange(steps), side="right") - 1
+    length = np.diff(borders)[stage]
+    place = (np.arange(episodes)[:, None] * length + np.arange(steps) - borders[stage]) / (episodes * length)
+    part = np.digitize(place, [VALIDATION_FROM, TEST_FROM])
+    # The window of step t reaches back to the action of step t - history.
+    whole = np.ones_like(part, dtype=bool)
+    for back in range(1, history + 1):
+        whole[:, back:] &= part[:, back:] == part[:, :-back]
+    return np.where(whole, part, -1)

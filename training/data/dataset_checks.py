@@ -1,0 +1,148 @@
+"""What a data set has to mean, checked when it is read: users write their own, from the logs of real robots.
+
+Each function raises `ModelError` in one line that names the place, what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.control.features import REST_LIMIT_DEG
+from modsoft.runtime.errors import ModelError, RobotFileError
+from modsoft.runtime.files import decoded
+
+ATTRIBUTES = {
+    "schema": "a whole number",
+    "recipe": "JSON: robot, strategy, ...",
+    "stage_borders": "whole numbers from 0 to the steps of an episode",
+    "redrawn": "a whole number, 0 for a real robot",
+}
+LENGTH_TOLERANCE = 1e-3  # of a unit vector: room for half precision and for numbers with four decimals
+RANGE_TOLERANCE = 1e-6  # of an action beyond [-1, 1]: room for the rounding of single precision
+
+Array = NDArray[np.float64]
+
+
+class Recipe(msgspec.Struct):
+    """The part of a recipe that every data set has; collected ones have more."""
+
+    robot: dict[str, Any]
+    strategy: str
+    steps: int | None = None
+    period_s: float | None = None
+
+
+def attributes(found: Any, where: Path) -> dict[str, Any]:
+    """All of `ATTRIBUTES` out of those of a file."""
+    missing = [name for name in ATTRIBUTES if name not in found]
+    if missing:
+        raise ModelError(f"{where}: not a data set of modsoft-collect: no attribute {missing[0]}, expected "
+                         f"{ATTRIBUTES[missing[0]]}")  # fmt: skip
+    return {name: found[name] for name in ATTRIBUTES}
+
+
+def whole_number(name: str, value: Any, where: Path) -> int:
+    """An attribute that counts something."""
+    array = np.asarray(value)
+    if array.shape not in ((), (1,)) or array.dtype.kind not in "iu" or int(array.item()) < 0:
+        raise ModelError(f"{where}: {name} is {_short(value)}, expected a whole number")
+    return int(array.item())
+
+
+def recipe(value: Any, steps: int, where: Path) -> dict[str, Any]:
+    """The recipe, which fits episodes of `steps` control steps, and whose robot can be read."""
+    try:
+        text = decoded(value) if isinstance(value, bytes) else value
+        found = json.loads(text)
+        said = msgspec.convert(found, Recipe)
+    except (ValueError, TypeError, RecursionError, msgspec.ValidationError) as error:
+        raise ModelError(f"{where}: its recipe cannot be read ({error}); expected {ATTRIBUTES['recipe']}") from error
+    try:
+        robot = robots.from_dict(said.robot, "robot")
+    except RobotFileError as error:  # of this file, not of a robot file that the user can mend
+        raise ModelError(f"{where}: its recipe's robot cannot be read ({error})") from error
+    if said.steps not in (None, steps):
+        raise ModelError(f"{where}: steps {said.steps} in its recipe, but its episodes have {steps}")
+    period_s = robot.loop.period_s
+    if said.period_s is not None and not math.isclose(said.period_s, period_s, rel_tol=1e-6):
+        raise ModelError(f"{where}: period_s {said.period_s:g} in its recipe, but hz of its robot means {period_s:g}")
+    return found
+
+
+def stage_borders(value: Any, steps: int, where: Path) -> NDArray[np.int64]:
+    """First step of each stage, and the end (stages + 1,)."""
+    found = np.asarray(value)
+    is_list = found.ndim == 1 and len(found) >= 2 and found.dtype.kind in "iu"
+    if not is_list or found[0] != 0 or found[-1] != steps or not (found[1:] >= found[:-1]).all():
+        raise ModelError(
+            f"{where}: stage_borders {_short(value)}, expected whole numbers that rise from 0 to {steps}, the steps of "
+            f"an episode; [0, {steps}] for a single stage"
+        )
+    return found.astype(np.int64)
+
+
+def shapes(configuration: tuple[int, ...], action: tuple[int, ...], robot: robots.Robot, where: Path) -> None:
+    """The arrays' shapes, against the robot's and each other's."""
+    episodes, steps = action[:2] if len(action) == 4 else (0, 0)
+    for name, found, expected, in_words in (
+        ("action", action, (episodes, steps, robot.modules, robot.action_size), "(episodes, steps, {1}, {2})"),
+        ("configuration", configuration, (episodes, steps + 1, robot.modules, 3), "(episodes, steps + 1, {1}, 3)"),
+    ):
+        if found != expected or 0 in found:
+            wanted = f"{expected}" if 0 not in expected else in_words.format(0, robot.modules, robot.action_size)
+            raise ModelError(f"{where}: {name} has the shape {found}, expected {wanted} for robot {robot.name}")
+
+
+def configuration(found: Array, where: Path) -> None:
+    """Finite unit vectors (E, K + 1, N, 3), each episode from rest."""
+    _finite("configuration", found, where)
+    length = np.linalg.norm(found, axis=-1)
+    wrong = np.argwhere(np.abs(length - 1.0) > LENGTH_TOLERANCE)
+    if len(wrong):
+        episode, step, module = map(int, wrong[0])
+        vector = ", ".join(f"{value:g}" for value in found[episode, step, module])
+        raise ModelError(
+            f"{where}: configuration of episode {episode}, step {step}, module {module + 1} is [{vector}], of length "
+            f"{length[episode, step, module]:.4g}; expected a unit vector [v_x, v_y, v_z]"
+        )
+    bent_deg = np.degrees(np.arccos(np.clip(found[:, 0, :, 2], -1.0, 1.0)))
+    wrong = np.argwhere(bent_deg > REST_LIMIT_DEG)
+    if len(wrong):
+        episode, module = map(int, wrong[0])
+        raise ModelError(
+            f"{where}: episode {episode} begins with module {module + 1} bent by {bent_deg[episode, module]:.0f} "
+            f"degrees, expected it at rest (at most {REST_LIMIT_DEG:g}); is the order [v_x, v_y, v_z], v_z along the "
+            "robot?"
+        )
+
+
+def action(found: Array, where: Path) -> None:
+    """Finite actions (E, K, N, A) in [-1, 1]."""
+    _finite("action", found, where)
+    wrong = np.argwhere(np.abs(found) > 1.0 + RANGE_TOLERANCE)
+    if len(wrong):
+        episode, step, module, number = map(int, wrong[0])
+        raise ModelError(
+            f"{where}: action a_{number} of episode {episode}, step {step}, module {module + 1} is "
+            f"{found[episode, step, module, number]:g}; expected actions in [-1, 1]"
+        )
+
+
+def _finite(name: str, found: Array, where: Path) -> None:
+    if not np.isfinite(found).all():
+        episode, step, module, _ = map(int, np.argwhere(~np.isfinite(found))[0])
+        raise ModelError(f"{where}: {name} holds values that are not finite, first in episode {episode}, step {step}, "
+                         f"module {module + 1}")  # fmt: skip
+
+
+def _short(value: Any) -> str:
+    text = " ".join(str(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."

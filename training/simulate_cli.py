@@ -1,0 +1,93 @@
+"""`modsoft-simulate`: an action sequence applied to the simulated robot from rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.entry_point import entry
+from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import NOT_AN_ARRAY, check_not_input, check_writable, written
+from modsoft.runtime.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+def read_actions(path: str, robot: Robot) -> Array:
+    """Actions (steps, N, A) in [-1, 1] from a .npy file; `ModelError` (65) where it is anything else."""
+    wanted = f"(steps, {robot.modules}, {robot.action_size}) for {robot.name}"
+    try:
+        actions = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise ModelError(f"{path}: no such file; expected a .npy array {wanted}") from error
+    except (OSError, *NOT_AN_ARRAY) as error:  # numpy's own words recommend loading it unsafely
+        why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged, or another format"
+        raise ModelError(f"{path}: not a .npy array of numbers ({why}); expected {wanted}") from error
+    if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiu":
+        raise ModelError(f"{path}: found no array of numbers; expected {wanted}")
+    if actions.ndim != 3 or actions.shape[1:] != (robot.modules, robot.action_size) or not len(actions):
+        raise ModelError(f"{path}: found shape {actions.shape}, expected {wanted}")
+    wrong = np.argwhere(~(np.abs(actions) <= 1.0))  # NaN is wrong too
+    if len(wrong):
+        step, module, action = (int(i) for i in wrong[0])
+        raise ModelError(
+            f"{path}: found {actions[step, module, action]} at step {step}, module {module + 1}, a_{action}; expected "
+            "actions in [-1, 1]"
+        )
+    return actions.astype(np.float64)
+
+
+def simulate(robot: Robot, actions: Array) -> dict[str, Array]:
+    """Applies actions (steps, N, A), one a control period, from rest.
+
+    Arrays of what was before the first and after each action: configuration (steps + 1, N, 3), [v_x, v_y, v_z];
+    positions (steps + 1, N, 3), m; directors (steps + 1, N, 3, 3), rows d1, d2, d3. `ModsoftError` if the robot's
+    state stops being finite.
+    """
+    from modsoft.training.simulation.elastica import (
+        Arm,  # PyElastica takes seconds to import: not for --help or a wrong file
+    )
+
+    arm = Arm(robot.robot.kind, robot.modules)
+    configuration, positions, directors = [arm.configuration], [arm.positions], [arm.directors]
+    for action in actions:
+        configuration.append(arm.step(action, robot.loop.period_s))
+        positions.append(arm.positions)
+        directors.append(arm.directors)
+    return {
+        "configuration": np.stack(configuration),
+        "positions": np.stack(positions),
+        "directors": np.stack(directors),
+    }
+
+
+def write(path: str, run: dict[str, Array]) -> None:
+    """Writes the arrays to `path` as it is, all of them or none."""
+    with written(Path(path)) as part, part.open("wb") as file:
+        np.savez(file, allow_pickle=False, **run)
+
+
+@click.command("modsoft-simulate")
+@click.option("--robot", "robot_file", required=True, metavar="FILE|NAME", help="Robot file, or a shipped robot.")
+@click.option("--actions", required=True, metavar="FILE", help=".npy array (steps, modules, actions) in [-1, 1].")
+@click.option("--out", required=True, metavar="FILE", help=".npz to write.")
+def command(robot_file: str, actions: str, out: str) -> None:
+    """Apply a sequence of actions, one a control period, to the simulated robot from rest.
+
+    --out gets configuration (steps + 1, modules, 3), that is [v_x, v_y, v_z], positions (steps + 1, modules, 3) in
+    metres and directors (steps + 1, modules, 3, 3) with rows d1, d2, d3; row 0 is the robot at rest.
+    """
+    check_writable(Path(out))
+    check_not_input(Path(out), Path(actions), Path(robot_file))
+    robot = robots.load(robot_file)
+    run = simulate(robot, read_actions(actions, robot))
+    write(out, run)
+    last = np.array2string(run["configuration"][-1], precision=4, suppress_small=True).replace("\n", "")
+    print(f"{out}: {len(run['configuration']) - 1} steps of {robot.loop.period_s:g} s; last configuration {last}")
+
+
+main = entry(command)

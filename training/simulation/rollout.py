@@ -1,0 +1,106 @@
+"""What a controller is worth: simulated robots in closed loop, and their distance from what was desired."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from modsoft.runtime.control.actuation import limited
+from modsoft.runtime.control.correction import Correction, NoCorrection
+from modsoft.runtime.control.features import Window, bending_error_deg, state_of
+from modsoft.runtime.control.tasks import ahead
+from modsoft.runtime.robot import Robot
+from modsoft.training.checkpoint import network_of
+from modsoft.training.simulation.fleet import Arms, Fleet
+
+Array = NDArray[np.float64]
+Actuate = Callable[[Array], Array]
+Measure = Callable[[int, Array], Array | None]
+
+
+def exactly(step: int, configuration: Array) -> Array | None:
+    """A tracker without fault."""
+    return configuration
+
+
+@dataclass
+class Pilot:
+    """Who drives one robot of a fleet through one task.
+
+    actuate: features (N, F) -> actuation (N, A); desired (K, N, 3): configurations at the start of each period.
+    measure: (step, true configuration (N, 3)) -> what the tracker says, or None for a lost frame, on which the runtime
+    holds the action and remembers the state before.
+    """
+
+    actuate: Actuate
+    history: int
+    desired: Array
+    correction: Correction = field(default_factory=NoCorrection)
+    measure: Measure = exactly
+
+
+class Flight(NamedTuple):
+    """What one robot did: at the start of every period and after the last, and the actions that were applied."""
+
+    configuration: Array  # (K + 1, N, 3)
+    actions: Array  # (K, N, A)
+    positions: Array  # (K + 1, N, 3), m, of the module ends
+    directors: Array  # (K + 1, N, 3, 3), rows d1, d2, d3 in the lab frame
+
+
+def fly(robot: Robot, robots: Fleet | Arms, pilots: Sequence[Pilot]) -> list[Flight]:
+    """Drives `robots`, at rest, each by its own pilot as the runtime would (`modsoft.runtime.loop`): at step k the
+    network is asked for desired[k + 1], the state at the end of the period. All tasks have the same length K."""
+    kind, steps = robot.robot.kind, len(pilots[0].desired)
+    if len(pilots) != robots.count or any(len(pilot.desired) != steps for pilot in pilots):
+        raise ValueError(f"{len(pilots)} pilots for {robots.count} robots; expected one each, of tasks of one length")
+    actions = np.zeros((steps, len(pilots), robot.modules, robot.action_size))
+    told = [(robots.configuration, robots.positions, robots.directors)]
+    state = [state_of(configuration, kind) for configuration in told[0][0]]
+    windows = [Window(pilot.history, at_rest, robot.action_size) for pilot, at_rest in zip(pilots, state, strict=True)]
+    targets = [ahead(pilot.desired) for pilot in pilots]
+    for k in range(steps):
+        for b, pilot in enumerate(pilots):
+            before = actions[k - 1, b] if k else np.zeros_like(actions[k, b])
+            measured = pilot.measure(k, told[-1][0][b])
+            if measured is not None:
+                state[b] = state_of(measured, kind)
+            windows[b].observe(state[b])
+            actions[k, b] = before
+            if measured is not None:
+                aim = pilot.correction.aim(targets[b][k], pilot.desired[k], measured)
+                raw = pilot.actuate(windows[b].features(state_of(aim, kind)))
+                actions[k, b] = limited(raw, before, robot.limits.largest_actuation_step)
+                pilot.correction.answered(raw, actions[k, b])
+            windows[b].applied(actions[k, b])
+        robots.step(actions[k], robot.loop.period_s)
+        told.append((robots.configuration, robots.positions, robots.directors))
+    configuration, positions, directors = (np.stack(values, axis=1) for values in zip(*told, strict=True))
+    return [Flight(configuration[b], actions[:, b], positions[b], directors[b]) for b in range(len(pilots))]
+
+
+def actuate_with(checkpoint: dict[str, Any]) -> Actuate:
+    """The checkpoint's network as a controller: features (N, F) -> actuation (N, A)."""
+    network = network_of(checkpoint)
+
+    def actuate(features: Array) -> Array:
+        with torch.no_grad():
+            return network(torch.from_numpy(features.astype(np.float32))[None])[0].double().numpy()
+
+    return actuate
+
+
+def angle_errors_deg(configuration: Array, desired: Array) -> Array:
+    """|bending angle - desired bending angle| (K, N), degrees, of a planar robot: configuration (K + 1, N, 3) at the
+    start of period k against the desired one of step k, as the paper counts it."""
+    return bending_error_deg(configuration[: len(desired)], desired)
+
+
+def configuration_errors_percent(configuration: Array, desired: Array) -> Array:
+    """|configuration - desired| (K, N), percent of the unit vector's length, at the same steps."""
+    return 100.0 * np.linalg.norm(configuration[: len(desired)] - desired, axis=-1)

@@ -1,0 +1,109 @@
+"""The simulated robots that data can be collected from, each behind one function: actions in, configurations out."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modsoft.runtime.errors import RobotFileError, UsageError
+from modsoft.runtime.robot import Robot
+from modsoft.training.simulation import fleet_kernel
+from modsoft.training.simulation.fleet import Arms, Fleet
+from modsoft.training.simulation.parameters import PASCAL_PER_BAR, PLANTS
+
+Array = NDArray[np.float64]
+
+
+class Variation(NamedTuple):
+    """How a robot differs from the drawing."""
+
+    stiffness: tuple[float, ...]  # factor of each module
+    tip_payload_kg: float
+
+
+class Simulate(Protocol):
+    """Robot and actions (B, K, N, A) of episodes from rest -> configurations (B, K + 1, N, 3), not finite where a robot
+    was lost; what one episode gives does not depend on the others beside it."""
+
+    def __call__(self, robot: Robot, actions: Array, *, variation: Variation | None = None) -> Array: ...
+
+
+class Plant(NamedTuple):
+    """A simulator that data can be collected from."""
+
+    name: str  # goes into the data set: two plants round differently
+    simulate: Simulate
+    together: int  # episodes that it likes to simulate at a time
+
+
+def fastest(robot: Robot) -> Plant:
+    """The compiled fleet where this installation has it, else PyElastica."""
+    return named(names()[0], robot)
+
+
+def names() -> list[str]:
+    """Of the plants that run here, the fastest first. The fleet's variants round differently from each other, so that
+    a name stands for one result wherever it runs."""
+    return [*(f"fleet-{variant}" for variant in reversed(fleet_kernel.variants())), "elastica"]
+
+
+def named(name: str, robot: Robot) -> Plant:
+    """The plant of that name; `UsageError` where it does not run here, `RobotFileError` if it cannot be this robot."""
+    if name not in names():
+        raise UsageError(f"the plant {name} does not run here; expected {', '.join(names())}")
+    _check(robot)
+    if name == "elastica":
+        return Plant(name, by_elastica, together=1)
+    # As many as the kernel's lanes: fewer cost the same.
+    return Plant(name, functools.partial(by_fleet, variant=name.removeprefix("fleet-")), together=8)
+
+
+def by_fleet(
+    robot: Robot, actions: Array, variant: str | None = None, *, variation: Variation | None = None
+) -> Array:
+    """Robots side by side in compiled code."""
+    fleet = Fleet(robot.robot.kind, robot.modules, len(actions), variant=variant, **_differences(variation))
+    return _run(fleet, actions, robot.loop.period_s)
+
+
+def by_elastica(robot: Robot, actions: Array, *, variation: Variation | None = None) -> Array:
+    """One robot after the other in PyElastica, the reference."""
+    arms = Arms(robot.robot.kind, robot.modules, len(actions), **_differences(variation))
+    return _run(arms, actions, robot.loop.period_s)
+
+
+def _differences(variation: Variation | None) -> dict[str, Any]:
+    return {} if variation is None else variation._asdict()
+
+
+def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:
+    configuration = [robots.configuration]
+    for action in np.moveaxis(actions, 1, 0):
+        robots.step(action, period_s)
+        reached = robots.configuration
+        reached[~robots.alive] = np.nan  # what was lost in the middle may not show at the module ends yet
+        configuration.append(reached)
+    return np.stack(configuration, axis=1)
+
+
+def _check(robot: Robot) -> None:
+    """What the robot file says and the simulated robot cannot do."""
+    plant, period_s = PLANTS[robot.robot.kind], robot.loop.period_s
+    steps = period_s / plant.time_step_s
+    if abs(steps - round(steps)) > 1e-6 * steps:
+        raise RobotFileError(
+            f"loop.hz {robot.loop.hz} is a period of {period_s:.6g} s; expected whole steps of {plant.time_step_s} s "
+            "for the simulated robot"
+        )
+    if robot.valve is not None:
+        stresses = (plant.actuators.rest_stress_pa, plant.actuators.full_stress_pa)
+        expected = [round(-stress / PASCAL_PER_BAR, 6) for stress in stresses]
+        found = [robot.valve.p_min_bar, robot.valve.p_max_bar]
+        if found != expected:
+            raise RobotFileError(
+                f"valve.p_min_bar, p_max_bar are {found[0]}, {found[1]}; the simulated robot knows {expected[0]}, "
+                f"{expected[1]} only"
+            )
