@@ -43,13 +43,17 @@ def weights_of(content: dict[str, Any], key: str | None, where: Path) -> Weights
         )
     if key is None and len(found) > 1:
         first = next(iter(found))
-        raise ModelError(f"{where}: state dicts of biLSTMs under {keys}; choose one in the TOML of --meta, such as "
-                         f'weights = "{first}"')  # fmt: skip
+        raise ModelError(
+            f"{where}: state dicts of biLSTMs under {keys}; choose one in the TOML of --meta, such as "
+            f'weights = "{first}"'
+        )
     held = found[key] if key is not None else next(iter(found.values()))
     prefixes = [name.removesuffix(ANCHOR) for name in held if name.endswith(ANCHOR)]
     if len(prefixes) > 1:
-        raise ModelError(f"{where}: several networks in one state dict, under {', '.join(map(repr, prefixes))}; save "
-                         "that of the biLSTM alone: torch.save(network.state_dict(), FILE)")  # fmt: skip
+        raise ModelError(
+            f"{where}: several networks in one state dict, under {', '.join(map(repr, prefixes))}; save "
+            "that of the biLSTM alone: torch.save(network.state_dict(), FILE)"
+        )
     own = {name.removeprefix(prefixes[0]): value for name, value in held.items() if name.startswith(prefixes[0])}
     _check_names(own, where)
     return {name: value.detach().float() for name, value in own.items()}
@@ -62,8 +66,9 @@ def refuse(content: dict[str, Any], where: Path, untold: str) -> NoReturn:
     weights_of(content, None, where)  # another network is not exported with --meta either
     (key,) = (key for key, _ in state_dicts(content))
     what = f"a checkpoint of another training, with a state dict under {key!r}" if key else "a bare state dict"
-    raise ModelError(f"{where}: {what}; its shapes cannot tell {untold}; say them in a TOML file: --meta FILE (--help "
-                     "shows one)")  # fmt: skip
+    raise ModelError(
+        f"{where}: {what}; its shapes cannot tell {untold}; say them in a TOML file: --meta FILE (--help shows one)"
+    )
 
 
 def _held(content: dict[str, Any], keys: str) -> str:
@@ -75,8 +80,12 @@ def _held(content: dict[str, Any], keys: str) -> str:
 def _check_names(weights: Weights, where: Path) -> None:
     """`ModelError` unless the names are exactly those of a biLSTM of some layers, and all are floats."""
     layers = sum(name.startswith("lstm.weight_hh_l") and not name.endswith("_reverse") for name in weights)
-    parts = [f"{part}_l{layer}{way}" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-             for layer in range(layers) for way in ("", "_reverse")]  # fmt: skip
+    parts = [
+        f"{part}_l{layer}{way}"
+        for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+        for layer in range(layers)
+        for way in ("", "_reverse")
+    ]
     expected = {"head.weight", "head.bias", *(f"lstm.{part}" for part in parts)}
     for word, names in (("no", expected - weights.keys()), ("further", weights.keys() - expected)):
         if names:

@@ -69,13 +69,17 @@ def initializers(weights: Weights, layers: int, directions: Sequence[str], prefi
     found: Weights = {}
     for layer in range(layers):
         for name, parts in PARTS:
-            found[f"{prefix}layer_{layer + 1}_{name}"] = np.stack([
-                np.concatenate([
-                    _regated(weights[f"{prefix}lstm.{part}_l{layer}{direction}"], TORCH_GATES, ONNX_GATES)
-                    for part in parts
-                ])
-                for direction in directions
-            ])
+            found[f"{prefix}layer_{layer + 1}_{name}"] = np.stack(
+                [
+                    np.concatenate(
+                        [
+                            _regated(weights[f"{prefix}lstm.{part}_l{layer}{direction}"], TORCH_GATES, ONNX_GATES)
+                            for part in parts
+                        ]
+                    )
+                    for direction in directions
+                ]
+            )
     found[f"{prefix}head_weight"] = np.ascontiguousarray(weights[f"{prefix}head.weight"].T)
     found[f"{prefix}head_bias"] = weights[f"{prefix}head.bias"]
     return found

@@ -38,8 +38,10 @@ def _check_robot(name: str) -> None:
         click.echo(f"task {task}: {steps} steps, {steps * robot.loop.period_s:g} s")
     if robot.valve is not None:
         valve = robot.valve
-        click.echo(f"valves: {valve.model}, full scale {valve.full_scale_bar:g} bar, {valve.p_min_bar:g} to "
-                   f"{valve.p_max_bar:g} bar; is full_scale_bar what the label says?")  # fmt: skip
+        click.echo(
+            f"valves: {valve.model}, full scale {valve.full_scale_bar:g} bar, {valve.p_min_bar:g} to "
+            f"{valve.p_max_bar:g} bar; is full_scale_bar what the label says?"
+        )
     for chamber in robot.chambers:
         click.echo(f"module {chamber.module} side {chamber.side}: channel {chamber.channel}")
     open_ends = _open_ends(robot, folder)
@@ -90,38 +92,80 @@ def _somebody_there() -> bool:
 
 
 @click.command("modsoft-runtime", context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
-@click.option("--port", default="", metavar="PORT",
-              help="Serial port of the board, such as /dev/ttyACM0 or COM3, or its USB serial number as --list-ports "
-                   "says it. [default: port under [serial] in the robot file]")  # fmt: skip
-@click.option("--robot", default="robot.toml", show_default=True, metavar="FILE|NAME",
-              help="Robot file, or a shipped robot.")  # fmt: skip
-@click.option("--model", default="model.onnx", show_default=True, metavar="FILE", type=click.Path(path_type=Path),
-              help="Controller, written by modsoft-export.")  # fmt: skip
-@click.option("--task", default="", metavar="NAME|FILE",
-              help="edge, down, or a .npy file of desired configurations (steps, modules, 3). [default: task under "
-                   "[loop] in the robot file, where every path starts from that file's folder]")  # fmt: skip
+@click.option(
+    "--port",
+    default="",
+    metavar="PORT",
+    help="Serial port of the board, such as /dev/ttyACM0 or COM3, or its USB serial number as --list-ports "
+    "says it. [default: port under [serial] in the robot file]",
+)
+@click.option(
+    "--robot", default="robot.toml", show_default=True, metavar="FILE|NAME", help="Robot file, or a shipped robot."
+)
+@click.option(
+    "--model",
+    default="model.onnx",
+    show_default=True,
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Controller, written by modsoft-export.",
+)
+@click.option(
+    "--task",
+    default="",
+    metavar="NAME|FILE",
+    help="edge, down, or a .npy file of desired configurations (steps, modules, 3). [default: task under "
+    "[loop] in the robot file, where every path starts from that file's folder]",
+)
 @click.option("--steps", type=click.IntRange(1), metavar="N", help="Stop after the first N control steps.")
-@click.option("--correction", default="none", show_default=True, type=click.Choice(["none", "integral"]),
-              help="integral: the accumulated configuration error shifts what the model is asked for.")  # fmt: skip
-@click.option("--tracker", type=click.Choice(["ndi", "replay"]), metavar="ndi|replay",
-              help="Where frames come from. [default: source under [tracker] in the robot file]")  # fmt: skip
-@click.option("--tracker-port", default="", metavar="PORT",
-              help="Serial port of the tracker (vega: its address; replay: a run's folder). [default: port under "
-                   "[tracker] in the robot file]")  # fmt: skip
-@click.option("--tool", "tools", multiple=True, metavar="FILE", type=click.Path(path_type=Path),
-              help="Tool definition file, once for each tool: base, then module 1 to N. [default: tools under "
-                   "[tracker] in the robot file]")  # fmt: skip
-@click.option("--runs-dir", default="runs", show_default=True, metavar="FOLDER", type=click.Path(path_type=Path),
-              help="Where the log of each run is kept.")  # fmt: skip
+@click.option(
+    "--correction",
+    default="none",
+    show_default=True,
+    type=click.Choice(["none", "integral"]),
+    help="integral: the accumulated configuration error shifts what the model is asked for.",
+)
+@click.option(
+    "--tracker",
+    type=click.Choice(["ndi", "replay"]),
+    metavar="ndi|replay",
+    help="Where frames come from. [default: source under [tracker] in the robot file]",
+)
+@click.option(
+    "--tracker-port",
+    default="",
+    metavar="PORT",
+    help="Serial port of the tracker (vega: its address; replay: a run's folder). [default: port under "
+    "[tracker] in the robot file]",
+)
+@click.option(
+    "--tool",
+    "tools",
+    multiple=True,
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Tool definition file, once for each tool: base, then module 1 to N. [default: tools under "
+    "[tracker] in the robot file]",
+)
+@click.option(
+    "--runs-dir",
+    default="runs",
+    show_default=True,
+    metavar="FOLDER",
+    type=click.Path(path_type=Path),
+    help="Where the log of each run is kept.",
+)
 @click.option("--yes", is_flag=True, help="Arm without asking.")
 @click.option("--dry-run", is_flag=True, help="Everything but the board: no valve port is opened.")
-@click.option("--list-ports", is_flag=True,
-              help="List the serial ports of this machine, Arduino MEGAs first, and leave.")  # fmt: skip
-@click.option("--check", metavar="FILE",
-              help="Read a robot file, say what it means and what it lacks, and leave.")  # fmt: skip
-@click.option("--print-robot", metavar="NAME",
-              help="Print a shipped robot's file to start your own from, and leave: cable-4, cable-6, pneumatic-2, "
-                   "pneumatic-3.")  # fmt: skip
+@click.option(
+    "--list-ports", is_flag=True, help="List the serial ports of this machine, Arduino MEGAs first, and leave."
+)
+@click.option("--check", metavar="FILE", help="Read a robot file, say what it means and what it lacks, and leave.")
+@click.option(
+    "--print-robot",
+    metavar="NAME",
+    help="Print a shipped robot's file to start your own from, and leave: cable-4, cable-6, pneumatic-2, pneumatic-3.",
+)
 @click.version_option(None, "-V", "--version", package_name="modsoft", prog_name="modsoft-runtime")
 def cli(**told: Any) -> None:
     """Run one task on a modular soft robot: tracker in, valve pressures out, at a fixed rate.

@@ -11,9 +11,7 @@ SLICE_S = 0.05  # waiting is cut into slices so that a lost device is noticed be
 SPIN_S = 0.001
 
 
-def spinning(
-    wait: Callable[[float], object], now: Callable[[], float] = time.monotonic
-) -> Callable[[float], object]:
+def spinning(wait: Callable[[float], object], now: Callable[[], float] = time.monotonic) -> Callable[[float], object]:
     """`wait` for a `Ticker`, but without sleep where at most a millisecond is left: what sleeps loses the processor,
     and its caches, to other processes."""
 

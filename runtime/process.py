@@ -13,8 +13,12 @@ from pathlib import Path
 from modsoft.runtime.errors import UsageError
 
 # Folders that libraries (numba, matplotlib, torch, onnxruntime, dask) write to, and their defaults below the home.
-BELOW_HOME = {"XDG_CACHE_HOME": ".cache", "XDG_CONFIG_HOME": ".config", "XDG_DATA_HOME": ".local/share",
-              "XDG_STATE_HOME": ".local/state"}  # fmt: skip
+BELOW_HOME = {
+    "XDG_CACHE_HOME": ".cache",
+    "XDG_CONFIG_HOME": ".config",
+    "XDG_DATA_HOME": ".local/share",
+    "XDG_STATE_HOME": ".local/state",
+}
 IF_SET = ("NUMBA_CACHE_DIR", "MPLCONFIGDIR", "TORCH_HOME", "TORCHINDUCTOR_CACHE_DIR", "DASK_TEMPORARY_DIRECTORY")
 PARTS = ("runtime", "training", "export", "hil", "study")
 

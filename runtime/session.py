@@ -82,8 +82,10 @@ def run(options: Options) -> None:
     port = ""
     if not options.dry_run:
         if robot.tracker.source == "replay":
-            raise UsageError("recorded frames say nothing of where the robot is, so no valve is driven by them; "
-                             "give --dry-run, or --tracker ndi")  # fmt: skip
+            raise UsageError(
+                "recorded frames say nothing of where the robot is, so no valve is driven by them; "
+                "give --dry-run, or --tracker ndi"
+            )
         port = _port(options.port or robot.serial.port)
     controller, digest = _model(options.model, robot)
     task = options.task or task_of(robot, beside)
@@ -117,12 +119,21 @@ def run(options: Options) -> None:
             _ask()
         tally = Tally(robot, len(desired))
         signals.hold()  # from here on there is a log to be closed
-        log = logs.RunLog(options.runs, robot.name, robot_text, {
-            "command": sys.argv[1:], "robot": robot.to_dict(), "task": task, "steps": len(desired),
-            "correction": options.correction,
-            "model": {"file": str(options.model), "sha256": digest, "description": _described(controller)},
-            "board": None if board is None else board.hello._asdict(), "port": port or None,
-        })  # fmt: skip
+        log = logs.RunLog(
+            options.runs,
+            robot.name,
+            robot_text,
+            {
+                "command": sys.argv[1:],
+                "robot": robot.to_dict(),
+                "task": task,
+                "steps": len(desired),
+                "correction": options.correction,
+                "model": {"file": str(options.model), "sha256": digest, "description": _described(controller)},
+                "board": None if board is None else board.hello._asdict(),
+                "port": port or None,
+            },
+        )
         error: BaseException | None = None
         try:
             exits.enter_context(keys)
@@ -132,11 +143,19 @@ def run(options: Options) -> None:
             rest = _rest(slot, judge, stop, missing=LostInRun)
             with StatusLine(lambda: _status(tally, log), sys.stderr):
                 Loop(
-                    robot, controller, desired, slot, judge, board or Rehearsal(),
-                    Ticker(robot.loop.period_s, time.monotonic, spinning(stop.wait)), stop, log.put, tally,
+                    robot,
+                    controller,
+                    desired,
+                    slot,
+                    judge,
+                    board or Rehearsal(),
+                    Ticker(robot.loop.period_s, time.monotonic, spinning(stop.wait)),
+                    stop,
+                    log.put,
+                    tally,
                     correction.named(options.correction, robot.modules),
                     WarmUp(robot, controller.actuate, judge, log.put),
-                ).run(rest)  # fmt: skip
+                ).run(rest)
         except BaseException as raised:  # noqa: BLE001 - raised again below, after the venting
             error = raised
         finish(board, log, tally, slot, error)
@@ -166,8 +185,17 @@ def finish(board: Board | None, log: logs.RunLog, tally: Tally, slot: Slot, erro
     if error is not None:
         code = error.exit_code if isinstance(error, ModsoftError) else INTERNAL_EXIT_CODE
         reason = str(error) or type(error).__name__
-    log.put({"event": "end", "mono_ns": began_ns, "exit_code": code, "reason": reason, "vented": vented,
-             "vented_ns": vented_ns, "still_bar": pressed})  # fmt: skip
+    log.put(
+        {
+            "event": "end",
+            "mono_ns": began_ns,
+            "exit_code": code,
+            "reason": reason,
+            "vented": vented,
+            "vented_ns": vented_ns,
+            "still_bar": pressed,
+        }
+    )
     if board is None:
         word = "dry run, no valve was touched"
     else:

@@ -94,8 +94,10 @@ class Tally:
         lines.append(f"tick lateness: {_words(found['late_ms'])}")
         lines.append(f"acknowledgement: {_words(found['acknowledged_ms'])}, {found['unacknowledged']} never came")
         held = ", ".join(f"{count} {word}" for word, count in self.bad.items())
-        lines.append(f"missed ticks: {self.missed}; held for want of a good frame: {sum(self.bad.values())}" +
-                     (f" ({held})" if held else ""))  # fmt: skip
+        lines.append(
+            f"missed ticks: {self.missed}; held for want of a good frame: {sum(self.bad.values())}"
+            + (f" ({held})" if held else "")
+        )
         return lines
 
 

@@ -28,8 +28,9 @@ def source(tmp_path_factory):
 def build_wheel(source, folder, **environment):
     subprocess.run(
         [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, source],
-        env={**os.environ, **environment}, check=True,
-    )  # fmt: skip
+        env={**os.environ, **environment},
+        check=True,
+    )
     return next(folder.glob("modsoft-*.whl"))
 
 

@@ -19,17 +19,29 @@ def run(folder, *command, expect=0):
     """Runs a command in `folder` with POSIX hidden from it and from its child processes."""
     environment = {**os.environ, "PYTHONPATH": str(HIDDEN), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, *map(str, command)], cwd=folder, env=environment, stdin=subprocess.DEVNULL,
-        capture_output=True, text=True, encoding="utf-8", timeout=120, check=False,
-    )  # fmt: skip
+        [sys.executable, *map(str, command)],
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        timeout=120,
+        check=False,
+    )
     assert done.returncode == expect, done.stderr
     return done
 
 
 def command(name, *arguments):
     """`python -c` for a console script, which may have another name on another system."""
-    where = {"modsoft-runtime": "runtime.cli", "modsoft-collect": "training.collect_cli", "modsoft-hil": "hil.cli",
-             "modsoft-train": "training.train_cli", "modsoft-export": "export.cli"}[name]  # fmt: skip
+    where = {
+        "modsoft-runtime": "runtime.cli",
+        "modsoft-collect": "training.collect_cli",
+        "modsoft-hil": "hil.cli",
+        "modsoft-train": "training.train_cli",
+        "modsoft-export": "export.cli",
+    }[name]
     return ("-c", f"from modsoft.{where} import main\nif __name__ == '__main__':\n    main()", *arguments)
 
 

@@ -8,5 +8,6 @@ mkdir -p build/types/modsoft
 for part in runtime training export; do ln -sfn "../../../$part" "build/types/modsoft/$part"; done
 for part in hil study; do ln -sfn "../../../tools/$part" "build/types/modsoft/$part"; done
 "$bin/ruff" check .
+"$bin/ruff" format --check --quiet .
 "$bin/python" tools/gen_protocol.py --check
 "$bin/mypy" -p modsoft.runtime -p modsoft.export -p modsoft.hil -p modsoft.training -p modsoft.study

@@ -63,15 +63,28 @@ STAGES = [
         ["modsoft-collect", "--robot", ROBOT, "--samples", "15000", "--strategy", "staged", "--out", str(DATA)],
         DATA,
         [
-            f"runtime/robots/{ROBOT}.toml", "training/simulation/*.[ch]", "training/simulation/*.py",
-            "training/data/*.py", *SHARED,
+            f"runtime/robots/{ROBOT}.toml",
+            "training/simulation/*.[ch]",
+            "training/simulation/*.py",
+            "training/data/*.py",
+            *SHARED,
         ],
     ),
     Stage(
         "train the biLSTM controller",
         # To a validation error that controls the robot well within the rig's limits; the time is only a bound.
-        ["modsoft-train", str(DATA), "--out", str(CHECKPOINT), "--iterations", "1000", "--target-percent", "0.7",
-         "--minutes", "5"],
+        [
+            "modsoft-train",
+            str(DATA),
+            "--out",
+            str(CHECKPOINT),
+            "--iterations",
+            "1000",
+            "--target-percent",
+            "0.7",
+            "--minutes",
+            "5",
+        ],
         CHECKPOINT,
         [str(DATA), *SHARED, "training/data/*.py"]
         + [f"training/{name}.py" for name in ("train", "optimizer", "networks", "checkpoint")],
@@ -84,8 +97,16 @@ STAGES = [
     ),
 ]
 RUN = [
-    "modsoft-hil", "--robot", ROBOT, "--model", str(MODEL), "--task", TASK, "--report", str(REPORT),
-]  # fmt: skip
+    "modsoft-hil",
+    "--robot",
+    ROBOT,
+    "--model",
+    str(MODEL),
+    "--task",
+    TASK,
+    "--report",
+    str(REPORT),
+]
 
 
 def run(command: list[str]) -> int:

@@ -42,8 +42,13 @@ def check(archive: Path, has_compiler: bool) -> None:
         def run(command: str, *arguments: object) -> str:
             done = subprocess.run(
                 [scripts / command, *map(str, arguments)],
-                cwd=folder, env=environment, capture_output=True, text=True, encoding="utf-8", check=False,
-            )  # fmt: skip
+                cwd=folder,
+                env=environment,
+                capture_output=True,
+                text=True,
+                encoding="utf-8",
+                check=False,
+            )
             expect(done.returncode == 0, f"{command}, exit code {done.returncode}\n{done.stderr}")
             return done.stdout
 
@@ -54,8 +59,20 @@ def check(archive: Path, has_compiler: bool) -> None:
         (folder / "robot.toml").write_text(run("modsoft-runtime", "--print-robot", "pneumatic-3"), encoding="utf-8")
         run("modsoft-runtime", "--check", "robot.toml")
         recording(folder / "recording.jsonl")
-        run("modsoft-runtime", "--dry-run", "--model", ROOT / "tools" / "models" / "pneumatic-3.onnx", "--task", "edge",
-            "--steps", 4, "--tracker", "replay", "--tracker-port", "recording.jsonl")  # fmt: skip
+        run(
+            "modsoft-runtime",
+            "--dry-run",
+            "--model",
+            ROOT / "tools" / "models" / "pneumatic-3.onnx",
+            "--task",
+            "edge",
+            "--steps",
+            4,
+            "--tracker",
+            "replay",
+            "--tracker-port",
+            "recording.jsonl",
+        )
         expect(len(list((folder / "runs").iterdir())) == 1, "the log of the dry run")
         run("python", "-c", ACTIONS)
         run("modsoft-simulate", "--robot", "pneumatic-2", "--actions", "actions.npy", "--out", "run.npz")

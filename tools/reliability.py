@@ -38,52 +38,86 @@ class Row(NamedTuple):
 
 
 ROWS: dict[int, Row] = {
-    1: Row("bit flips", "drop, count",
-           "native parser 10^7 frames in tests, 10^8 on demand; firmware on the emulator 10^4 in tests, 10^6 on "
-           "demand: 0 wrong applied, recovery within one frame"),
-    2: Row("dropped, inserted bytes", "resynchronise at the next delimiter",
-           "10^6: 0 wrong, the next good frame always accepted"),
+    1: Row(
+        "bit flips",
+        "drop, count",
+        "native parser 10^7 frames in tests, 10^8 on demand; firmware on the emulator 10^4 in tests, 10^6 on "
+        "demand: 0 wrong applied, recovery within one frame",
+    ),
+    2: Row(
+        "dropped, inserted bytes",
+        "resynchronise at the next delimiter",
+        "10^6: 0 wrong, the next good frame always accepted",
+    ),
     3: Row("truncated frame, silence inside a frame", "discarded; the link timer still fires", "as row 2"),
-    4: Row("duplicated, reordered, replayed old session", "acknowledged or refused, not applied",
-           "10^5: 0 applied again"),
-    5: Row("garbage at line rate, 10 s", "vent by the link timer, then answer",
-           "0 applied; vented in 700 ms; HELLO within 1 s after; no watchdog reset"),
+    4: Row(
+        "duplicated, reordered, replayed old session", "acknowledged or refused, not applied", "10^5: 0 applied again"
+    ),
+    5: Row(
+        "garbage at line rate, 10 s",
+        "vent by the link timer, then answer",
+        "0 applied; vented in 700 ms; HELLO within 1 s after; no watchdog reset",
+    ),
     6: Row("cable pulled", "board vents, host stops cleanly", "vented in 700 ms; host notices in 150 ms"),
-    7: Row("plugged in again under another name",
-           "found by its USB identity, HELLO, new ARM, never by itself to RUNNING", "IDLE in 8 s; 20 of 20"),
-    8: Row("board reset in mid-run", "host sees the boot id change, goes silent, sends no stale set-point",
-           "noticed in 1.2 s, outputs 0 in 130 ms, back in 6 s; 50 of 50"),
+    7: Row(
+        "plugged in again under another name",
+        "found by its USB identity, HELLO, new ARM, never by itself to RUNNING",
+        "IDLE in 8 s; 20 of 20",
+    ),
+    8: Row(
+        "board reset in mid-run",
+        "host sees the boot id change, goes silent, sends no stale set-point",
+        "noticed in 1.2 s, outputs 0 in 130 ms, back in 6 s; 50 of 50",
+    ),
     9: Row("host would talk to the bootloader", "silent until HELLO", "0 bytes in 100 opens"),
     10: Row("host SIGKILLed", "board vents", "all 0 in 670 ms from 0.35 bar"),
-    11: Row("host SIGSTOPped; control thread stuck while I/O lives", "vent by link timer; by control timer",
-            "670 ms; 1.4 s; on return the fault is latched"),
-    12: Row("Ctrl-C, SIGTERM, SIGHUP, exception", "VENT, wait for the board's word, exit code",
-            '100 of 100 at random phases; "vented" is only said after the board said so'),
-    13: Row("tracker off, intermittent", "hold one tick, ramp-vent at three",
-            "vent starts within 1.2 s + 50 ms of the last good frame"),
-    14: Row("tracker frozen (same frame again)", "detected",
-            "within 3 ticks; no false alarm in 1 h of simulated noise"),
+    11: Row(
+        "host SIGSTOPped; control thread stuck while I/O lives",
+        "vent by link timer; by control timer",
+        "670 ms; 1.4 s; on return the fault is latched",
+    ),
+    12: Row(
+        "Ctrl-C, SIGTERM, SIGHUP, exception",
+        "VENT, wait for the board's word, exit code",
+        '100 of 100 at random phases; "vented" is only said after the board said so',
+    ),
+    13: Row(
+        "tracker off, intermittent",
+        "hold one tick, ramp-vent at three",
+        "vent starts within 1.2 s + 50 ms of the last good frame",
+    ),
+    14: Row(
+        "tracker frozen (same frame again)", "detected", "within 3 ticks; no false alarm in 1 h of simulated noise"
+    ),
     15: Row("stale, delayed frames", "never used", "0 older than one period used"),
     16: Row("NaN (a missing tool is NaN in NDI's client)", "rejected, never reaches the model", "0 in 10^4"),
-    17: Row("outlier jump", "gated on the fastest possible motion",
-            "command unchanged on that tick; back within 3 ticks"),
+    17: Row(
+        "outlier jump", "gated on the fastest possible motion", "command unchanged on that tick; back within 3 ticks"
+    ),
     18: Row("marker hidden, wrong number, swapped", "no partial state is used", "as row 13"),
     19: Row("frame numbers or stamps going backwards", "dropped, counted", "0 used"),
-    20: Row("damaged model file", "refused before the port is opened",
-            "200 of 200 damaged files, within 2 s, no byte on the wire"),
-    21: Row("model of another state or action size, history, opset",
-            "refused, message names expected and found", "all"),
+    20: Row(
+        "damaged model file",
+        "refused before the port is opened",
+        "200 of 200 damaged files, within 2 s, no byte on the wire",
+    ),
+    21: Row(
+        "model of another state or action size, history, opset", "refused, message names expected and found", "all"
+    ),
     22: Row("model gives NaN or out of range", "fault, vent", "0 NaN sent"),
     23: Row("channels do not match the robot file; protocol hash differs", "ARM refused", "all"),
     24: Row("port busy, no permission, not our board", "clear error, own exit code", "within 3 s, no retry storm"),
     25: Row("disk full while logging", "control goes on, the log says so", "no late tick"),
-    26: Row("starved processor, late ticks", "skip, never burst; log the lateness",
-            "two SETs never less than half a period apart; more than two missed: vent"),
+    26: Row(
+        "starved processor, late ticks",
+        "skip, never burst; log the lateness",
+        "two SETs never less than half a period apart; more than two missed: vent",
+    ),
     27: Row("wall clock steps", "no effect", "commands identical"),
     28: Row("firmware hangs", "watchdog", "outputs 0 in 130 ms"),
     29: Row("pressure sensor stuck, over-pressure, leak", "fault, vent", "dump in 110 ms; leak in 2.1 s"),
     30: Row("host does not read", "board keeps controlling", "loop jitter below 2 ms"),
-}  # fmt: skip
+}
 
 CLOCKS = {"emulated": "board's cycles", "virtual": "injected", "host": "wall", "none": ""}
 
@@ -183,10 +217,18 @@ def run_tests(lines: Path, full: bool) -> int:
 
 @click.command("reliability", help=__doc__, context_settings={"show_default": True})
 @click.option("--full", is_flag=True, help="The matrix's own numbers of tries; takes hours.")
-@click.option("--lines", type=click.Path(exists=True, dir_okay=False, path_type=Path),
-              help="Run nothing; make the page from the lines that pytest --matrix FILE kept.")  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path), default=ROOT / "docs" / "reliability.md",
-              show_default="docs/reliability.md", help="The page.")  # fmt: skip
+@click.option(
+    "--lines",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Run nothing; make the page from the lines that pytest --matrix FILE kept.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=ROOT / "docs" / "reliability.md",
+    show_default="docs/reliability.md",
+    help="The page.",
+)
 def cli(full: bool, lines: Path | None, out: Path) -> int:
     command = "tools/reliability.py --full" if full else "make reliability"
     code = 0

@@ -84,8 +84,12 @@ def page(soak: Soak, about: dict[str, str]) -> tuple[str, bool]:
     stalled_s, seconds = 1e-3 * sum(ran.stalled_ms for ran in runs), sum(ran.seconds for ran in runs)
     lines = ["# The soak", ""]
     lines += [f"- {name}: {value}" for name, value in about.items()]
-    lines += ["", f"{sum(ran.ticks for ran in runs)} control ticks in {len(runs)} runs, {len(faults)} faults of "
-                  f"{len({each.fault.name for each in faults})} kinds.", ""]  # fmt: skip
+    lines += [
+        "",
+        f"{sum(ran.ticks for ran in runs)} control ticks in {len(runs)} runs, {len(faults)} faults of "
+        f"{len({each.fault.name for each in faults})} kinds.",
+        "",
+    ]
     lines += [
         f"- Every fault noticed and named: {'yes' if not wrong_faults else f'**no**, {len(wrong_faults)} not'}.",
         f"- Valve outputs, by the timer registers, against the set-points of the log at all times: at most "
@@ -99,8 +103,10 @@ def page(soak: Soak, about: dict[str, str]) -> tuple[str, bool]:
         *(f"    - {word}" for word in wrong_runs),
         "- Memory of the longest run: " + memory(longest, growth) + (" **Too much.**" if grew else ""),
         *(f"- Memory of the {name}, all the time: {_range(mib)}" for name, mib in soak.helpers_mib.items()),
-        "", *fault_rows(faults), "",
-    ]  # fmt: skip
+        "",
+        *fault_rows(faults),
+        "",
+    ]
     return "\n".join(lines), not (wrong_faults or wrong_runs or grew)
 
 
@@ -121,10 +127,18 @@ def _range(mib: list[float]) -> str:
 @click.option("--minutes", default=60.0, type=click.FloatRange(min=0.1), help="Of the rig.")
 @click.option("--every", "every_s", default=55.0, type=click.FloatRange(min=2.0), help="Seconds between two faults.")
 @click.option("--seed", default=1, help="Of the faults and their times.")
-@click.option("--model", type=click.Path(exists=True, dir_okay=False, path_type=Path),
-              help="Controller of modsoft-export.  [default: the shipped one, else that of make demo]")  # fmt: skip
-@click.option("--out", default=ROOT / "build" / "soak", type=click.Path(file_okay=False, path_type=Path),
-              show_default="build/soak", help="A new folder below it gets all traces and report.md.")  # fmt: skip
+@click.option(
+    "--model",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Controller of modsoft-export.  [default: the shipped one, else that of make demo]",
+)
+@click.option(
+    "--out",
+    default=ROOT / "build" / "soak",
+    type=click.Path(file_okay=False, path_type=Path),
+    show_default="build/soak",
+    help="A new folder below it gets all traces and report.md.",
+)
 @click.option("--report", type=click.Path(dir_okay=False, path_type=Path), help="Write the report here too.")
 @click.option("--proofs", is_flag=True, help="Then the failure matrix with its full numbers: hours.")
 def cli(

@@ -72,8 +72,10 @@ def _check_archive(path: Path) -> None:
     compressed, nothing twice, no TorchScript."""
     with path.open("rb") as file:
         if file.read(len(OLD_FORMAT)) == OLD_FORMAT:
-            raise ModelError(f"{path}: not a checkpoint of modsoft-train (in the format of torch before 1.6); where it "
-                             "was made, save it again without _use_new_zipfile_serialization=False")  # fmt: skip
+            raise ModelError(
+                f"{path}: not a checkpoint of modsoft-train (in the format of torch before 1.6); where it "
+                "was made, save it again without _use_new_zipfile_serialization=False"
+            )
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         if damaged := archive.testzip():

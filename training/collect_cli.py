@@ -97,9 +97,7 @@ def cli(
         bar.update(done - bar.n)
 
     try:
-        made = collect(
-            robot, out, samples, strategy, seed, steps, jobs or cores(), chosen, progress, backend, given
-        )  # fmt: skip
+        made = collect(robot, out, samples, strategy, seed, steps, jobs or cores(), chosen, progress, backend, given)
     finally:
         if bar is not None:
             bar.close()

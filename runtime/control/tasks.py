@@ -125,9 +125,7 @@ def load_task(name_or_file: str, robot: Robot) -> Array:
     if not isinstance(desired, np.ndarray):
         raise UsageError(f"task file {name_or_file}: an archive of arrays (.npz); write one array with numpy.save")
     if desired.ndim != 3 or desired.shape[1:] != (robot.modules, 3):
-        raise UsageError(
-            f"task file {name_or_file}: found shape {desired.shape}, expected (steps, {robot.modules}, 3)"
-        )
+        raise UsageError(f"task file {name_or_file}: found shape {desired.shape}, expected (steps, {robot.modules}, 3)")
     if not len(desired):
         raise UsageError(f"task file {name_or_file}: found 0 steps, expected at least 1")
     if desired.dtype.kind != "f" or not np.allclose(np.linalg.norm(desired, axis=-1), 1.0, atol=1e-6):

@@ -52,8 +52,12 @@ FITTING = {
     "nested": lambda w: {"epoch": 3, "model_state_dict": w, "optimizer_state_dict": {"state": {}, "param_groups": []}},
     "deeper": lambda w: {"last": {"state_dict": prefixed(w, "net.module.")}},
 }
-KEYS = {"lightning": "state_dict", "lightning with a loss": "state_dict", "nested": "model_state_dict",
-        "deeper": "last.state_dict"}  # fmt: skip
+KEYS = {
+    "lightning": "state_dict",
+    "lightning with a loss": "state_dict",
+    "nested": "model_state_dict",
+    "deeper": "last.state_dict",
+}
 
 
 @pytest.mark.parametrize("kind", FITTING)

@@ -475,8 +475,12 @@ def test_vented_is_a_word_from_after_the_request(rig):
     port.run(110)
     assert port.pending
     assert board.vent()
-    asked_ms = max(at for at, data in port.written
-                   for frame in protocol.Parser().feed(data) if isinstance(frame.message, protocol.Vent))  # fmt: skip
+    asked_ms = max(
+        at
+        for at, data in port.written
+        for frame in protocol.Parser().feed(data)
+        if isinstance(frame.message, protocol.Vent)
+    )
     assert port.now_ms - 1e3 * board.status_age_s > asked_ms
 
 

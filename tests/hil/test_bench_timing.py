@@ -44,8 +44,10 @@ def test_lateness_skipped_slots_and_bursts_are_counted(loop):
 
 
 def test_the_others_are_set_against_ours(loop):
-    rows = [{"busy": 0, "hz": 25.0, "pace": pace, "p50_ms": p50, "p99_ms": 1.0}
-            for pace, p50 in (("our ticker", 0.1), ("asyncio", 0.5))]  # fmt: skip
+    rows = [
+        {"busy": 0, "hz": 25.0, "pace": pace, "p50_ms": p50, "p99_ms": 1.0}
+        for pace, p50 in (("our ticker", 0.1), ("asyncio", 0.5))
+    ]
     assert loop.ratios(rows) == [
         {"busy": 0, "hz": 25.0, "pace": "asyncio", "p50_ms_over_ours": 5.0, "p99_ms_over_ours": 1.0}
     ]

@@ -77,22 +77,33 @@ P_MAX_COUNTS = 0.35 / 3 * COUNTS  # 477.9
 # Of the registers: each breaks the lines named with it, and no other.
 WILD = {
     "full duty for 2 s before anything": (
-        lambda r: told(r, r.start_ns - 3_000_000_000, r.start_ns - 1_000_000_000, COUNTS), {BEFORE, LARGEST}),
+        lambda r: told(r, r.start_ns - 3_000_000_000, r.start_ns - 1_000_000_000, COUNTS),
+        {BEFORE, LARGEST},
+    ),
     "a count just before the first set-point": (
-        lambda r: told(r, r.start_ns - 2_000_000, r.start_ns - 1_000_000, 1), {BEFORE}),
+        lambda r: told(r, r.start_ns - 2_000_000, r.start_ns - 1_000_000, 1),
+        {BEFORE},
+    ),
     "full duty for 10 ms, 12 ms after a tick": (
-        lambda r: told(r, r.mono_ns[60] + 12_000_000, r.mono_ns[60] + 22_000_000, COUNTS), {OUTSIDE, LARGEST}),
+        lambda r: told(r, r.mono_ns[60] + 12_000_000, r.mono_ns[60] + 22_000_000, COUNTS),
+        {OUTSIDE, LARGEST},
+    ),
     "the largest pressure for 10 ms, 12 ms after a tick": (
-        lambda r: told(r, r.mono_ns[60] + 12_000_000, r.mono_ns[60] + 22_000_000, 478, channel=4), {OUTSIDE}),
+        lambda r: told(r, r.mono_ns[60] + 12_000_000, r.mono_ns[60] + 22_000_000, 478, channel=4),
+        {OUTSIDE},
+    ),
     "two counts above the first set-point, on the way to it": (
-        lambda r: told(r, r.start_ns + 12_000_000, r.start_ns + 22_000_000, round(0.08 / 3 * COUNTS) + 2), {OUTSIDE}),
+        lambda r: told(r, r.start_ns + 12_000_000, r.start_ns + 22_000_000, round(0.08 / 3 * COUNTS) + 2),
+        {OUTSIDE},
+    ),
     "open again for 0.9 s after the vent": (
-        lambda r: told(r, r.end_ns + 400_000_000, r.end_ns + 1_300_000_000, 300), {OUTSIDE, VENTED}),
-    "one count again after the vent": (
-        lambda r: told(r, r.end_ns + 400_000_000, r.end_ns + 401_000_000, 1), {VENTED}),
+        lambda r: told(r, r.end_ns + 400_000_000, r.end_ns + 1_300_000_000, 300),
+        {OUTSIDE, VENTED},
+    ),
+    "one count again after the vent": (lambda r: told(r, r.end_ns + 400_000_000, r.end_ns + 401_000_000, 1), {VENTED}),
     "one count that stays": (lambda r: other_duty(r, 1, rows=slice(-1, None)), {VENTED}),
     "vented too late": (lambda r: told(r, r.end_ns + 1_000_000, r.end_ns + 240_000_000, 1), {VENTED}),
-}  # fmt: skip
+}
 
 FLAWS = {
     "exit code of modsoft-runtime": lambda r: {"runtime_exit": 79},

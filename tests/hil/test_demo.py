@@ -135,14 +135,16 @@ def test_the_stages_hang_together(demo):
 
 
 # What a stage runs, and what of that shapes no result: messages, the command line, who works where.
-ENTRIES = {"modsoft-collect": "training/data/collect.py", "modsoft-train": "training/train.py",
-           "modsoft-export": "export/write.py"}  # fmt: skip
+ENTRIES = {
+    "modsoft-collect": "training/data/collect.py",
+    "modsoft-train": "training/train.py",
+    "modsoft-export": "export/write.py",
+}
 SHAPELESS = {
     *(f"runtime/{name}.py" for name in ("errors", "entry_point", "validation_messages", "files", "locks")),
     "training/data/workers.py",
     "training/data/coverage.py",
 }
-
 
 
 def imported(path, found):

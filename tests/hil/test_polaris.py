@@ -227,8 +227,10 @@ class Rig:
         self.tools = write_tool_files(folder, tools)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "modsoft.hil.polaris", "--link", str(self.link), *options],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         ready = json.loads(self.process.stdout.readline())
         assert ready["event"] == "ready"
         self.port = ready["port"]
@@ -265,9 +267,7 @@ def test_real_client_reads_what_is_shown(tmp_path, firmware, tools):
     with Rig(tmp_path, tools, "--firmware", firmware) as rig:
         shown = np.array(poses(tools))
         angle = np.radians(30.0)
-        shown[1, :3, :3] = [
-            [np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]
-        ]  # fmt: skip
+        shown[1, :3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
         rig.send(poses=shown.tolist())
         source = rig.connect()
         frame = read_until(source, lambda frame: frame.valid.all())

@@ -15,8 +15,14 @@ TOP = 4095
 def pwm(t_ms, channel, duty, lag_ns=0):
     counts = round(duty * (TOP + 1))
     raw = [counts - 1, TOP] if counts else [0, 0]
-    return {"event": "pwm", "t_us": t_ms * 1e3, "mono_ns": int(t_ms * 1e6) + lag_ns, "channel": channel,
-            "duty": duty, "raw": raw}  # fmt: skip
+    return {
+        "event": "pwm",
+        "t_us": t_ms * 1e3,
+        "mono_ns": int(t_ms * 1e6) + lag_ns,
+        "channel": channel,
+        "duty": duty,
+        "raw": raw,
+    }
 
 
 READY = {"event": "ready", "channels": 3, "t_us": 0.0, "mono_ns": 0}
@@ -71,10 +77,20 @@ def test_a_line_cut_by_a_kill_is_left_out(tmp_path):
 
 
 def tick(number, commanded):
-    return {"tick": number, "mono_ns": 400_000_000 * number, "late_ms": 0.5, "missed": 0, "verdict": "good",
-            "frame": None,
-            "sent": commanded is not None, "desired": [[0, 0, 1]] * 3, "configuration": [[0, 0, 1]] * 3, "board": None,
-            "acknowledged": {"tick": number - 1, "ms": 7.0}, "commanded_bar": commanded}  # fmt: skip
+    return {
+        "tick": number,
+        "mono_ns": 400_000_000 * number,
+        "late_ms": 0.5,
+        "missed": 0,
+        "verdict": "good",
+        "frame": None,
+        "sent": commanded is not None,
+        "desired": [[0, 0, 1]] * 3,
+        "configuration": [[0, 0, 1]] * 3,
+        "board": None,
+        "acknowledged": {"tick": number - 1, "ms": 7.0},
+        "commanded_bar": commanded,
+    }
 
 
 @pytest.fixture

@@ -31,9 +31,13 @@ SCRIPTS = Path(sys.executable).parent
 def script(name, *arguments, **options):
     """A console script, run to its end: (exit code, last line of standard error)."""
     done = subprocess.run(
-        [SCRIPTS / name, *map(str, arguments)], capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=60,
+        [SCRIPTS / name, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        timeout=60,
         **options,
-    )  # fmt: skip
+    )
     return done.returncode, done.stderr.strip()
 
 
@@ -123,8 +127,16 @@ def ticked(folder):
 
 def rig_command(folder, model):
     return [
-        SCRIPTS / "modsoft-hil", "--robot", "pneumatic-3", "--model", model, "--task", "down", "--report", folder,
-    ]  # fmt: skip
+        SCRIPTS / "modsoft-hil",
+        "--robot",
+        "pneumatic-3",
+        "--model",
+        model,
+        "--task",
+        "down",
+        "--report",
+        folder,
+    ]
 
 
 @pytest.mark.realtime
@@ -133,9 +145,12 @@ def test_nothing_outlives_the_rig(number, code, model_file, tmp_path):
     out = tmp_path / "out"
     temporary = {"TMPDIR": str(tmp_path)}  # a killed process leaves its temporary folders
     with subprocess.Popen(
-        rig_command(out, model_file), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        rig_command(out, model_file),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
         env={**os.environ, **temporary},
-    ) as process:  # fmt: skip
+    ) as process:
         try:
             wait_until(lambda: ticked(out) or process.poll() is not None, 30)
             assert process.poll() is None

@@ -202,8 +202,23 @@ def test_a_short_soak(tool, model_file, tmp_path, monkeypatch):
     chosen = [fault for fault in FAULTS if fault.name in ("tool hidden for a moment", "board reset")]
     monkeypatch.setattr(soaks, "FAULTS", chosen)
     out, report = tmp_path / "out", tmp_path / "soak.md"
-    monkeypatch.setattr(sys, "argv", ["soak", "--minutes", "0.6", "--every", "3", "--model", str(model_file),
-                                      "--out", str(out), "--report", str(report)])  # fmt: skip
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "soak",
+            "--minutes",
+            "0.6",
+            "--every",
+            "3",
+            "--model",
+            str(model_file),
+            "--out",
+            str(out),
+            "--report",
+            str(report),
+        ],
+    )
     with pytest.raises(SystemExit) as left:
         tool.main()
     page = report.read_text()

@@ -113,5 +113,11 @@ def test_row_23_channels_or_protocol_hash_differ(matrix_row, monkeypatch):
                 stepped_host(emulated)
         assert rises(emulated.trace) == 0
     tries = len(refused) + len(MISFITS) + len(foreign)
-    matrix_row(23, fault="channels, limits, session or protocol hash differ", tries=tries, limit="ARM refused, all",
-               worst=f"{tries} of {tries} refused", clock="none")  # fmt: skip
+    matrix_row(
+        23,
+        fault="channels, limits, session or protocol hash differ",
+        tries=tries,
+        limit="ARM refused, all",
+        worst=f"{tries} of {tries} refused",
+        clock="none",
+    )

@@ -88,10 +88,22 @@ def test_row_05_garbage_at_line_rate(matrix_row, full):
 
     tries = 10 if full else 2
     vented, answered = worst(side_by_side(tries, attempt, AT_ONCE))
-    matrix_row(5, fault=f"garbage at line rate, {FLOOD_S} s", tries=tries, limit="0 applied, all 0 in 700 ms, no reset",
-               worst=f"0 applied, {vented:.0f} ms, no reset", clock="emulated")  # fmt: skip
-    matrix_row(5, fault="garbage at line rate: HELLO after it", tries=tries, limit="1 s", worst=f"{answered:.0f} ms",
-               clock="emulated")  # fmt: skip
+    matrix_row(
+        5,
+        fault=f"garbage at line rate, {FLOOD_S} s",
+        tries=tries,
+        limit="0 applied, all 0 in 700 ms, no reset",
+        worst=f"0 applied, {vented:.0f} ms, no reset",
+        clock="emulated",
+    )
+    matrix_row(
+        5,
+        fault="garbage at line rate: HELLO after it",
+        tries=tries,
+        limit="1 s",
+        worst=f"{answered:.0f} ms",
+        clock="emulated",
+    )
     assert vented <= 700
     assert answered <= 1000
 
@@ -111,10 +123,17 @@ def test_row_06_cable_pulled(matrix_row, full):
 
     tries = 50 if full else 10
     vented, noticed = worst(side_by_side(tries, attempt, AT_ONCE))
-    matrix_row(6, fault="cable pulled: board vents", tries=tries, limit="all 0 in 700 ms", worst=f"{vented:.0f} ms",
-               clock="emulated")  # fmt: skip
-    matrix_row(6, fault="cable pulled: host notices", tries=tries, limit="150 ms", worst=f"{noticed:.1f} ms",
-               clock="emulated")  # fmt: skip
+    matrix_row(
+        6,
+        fault="cable pulled: board vents",
+        tries=tries,
+        limit="all 0 in 700 ms",
+        worst=f"{vented:.0f} ms",
+        clock="emulated",
+    )
+    matrix_row(
+        6, fault="cable pulled: host notices", tries=tries, limit="150 ms", worst=f"{noticed:.1f} ms", clock="emulated"
+    )
     assert vented <= 700
     assert noticed <= 150
 
@@ -137,10 +156,14 @@ def test_row_08_board_reset_in_mid_run(matrix_row, full):
 
     tries = 50 if full else 20
     vented, noticed, back = worst(side_by_side(tries, attempt, AT_ONCE))
-    matrix_row(8, fault="board reset in mid-run", tries=tries,
-               limit="noticed in 1.2 s, outputs 0 in 130 ms, back in 6 s, no byte sent to it",
-               worst=f"{noticed / 1e3:.2f} s, {vented:.1f} ms, {back / 1e3:.2f} s, 0 bytes",
-               clock="emulated")  # fmt: skip
+    matrix_row(
+        8,
+        fault="board reset in mid-run",
+        tries=tries,
+        limit="noticed in 1.2 s, outputs 0 in 130 ms, back in 6 s, no byte sent to it",
+        worst=f"{noticed / 1e3:.2f} s, {vented:.1f} ms, {back / 1e3:.2f} s, 0 bytes",
+        clock="emulated",
+    )
     assert vented <= 130
     assert noticed <= 1200
     assert back <= 6000
@@ -167,8 +190,14 @@ def test_row_10_host_killed(matrix_row, full):
                 assert rises(board.trace, since) == 0
                 results.append(vented_ms(board, since, event["t_us"]))
     tries = len(results)
-    matrix_row(10, fault="host SIGKILLed", tries=tries, limit="all 0 in 670 ms from 0.35 bar",
-               worst=f"{max(results):.0f} ms", clock="emulated")  # fmt: skip
+    matrix_row(
+        10,
+        fault="host SIGKILLed",
+        tries=tries,
+        limit="all 0 in 670 ms from 0.35 bar",
+        worst=f"{max(results):.0f} ms",
+        clock="emulated",
+    )
     assert max(results) <= 670
 
 
@@ -185,8 +214,9 @@ def test_row_28_firmware_hangs(matrix_row, full):
 
     tries = 100 if full else 10
     vented = max(side_by_side(tries, attempt, AT_ONCE))
-    matrix_row(28, fault="firmware hangs", tries=tries, limit="all 0 in 130 ms", worst=f"{vented:.1f} ms",
-               clock="emulated")  # fmt: skip
+    matrix_row(
+        28, fault="firmware hangs", tries=tries, limit="all 0 in 130 ms", worst=f"{vented:.1f} ms", clock="emulated"
+    )
     assert vented <= 130
 
 
@@ -215,12 +245,24 @@ def test_row_29_sensors(matrix_row, full):
 
     tries = 60 if full else 6
     found = dict(zip((name for name, *_ in faults), worst(side_by_side(tries, attempt, AT_ONCE)), strict=True))
-    matrix_row(29, fault="over-pressure: dumped", tries=tries, limit="all 0 in 110 ms",
-               worst=f"{found['over-pressure']:.1f} ms", clock="emulated")  # fmt: skip
+    matrix_row(
+        29,
+        fault="over-pressure: dumped",
+        tries=tries,
+        limit="all 0 in 110 ms",
+        worst=f"{found['over-pressure']:.1f} ms",
+        clock="emulated",
+    )
     for name in ("stuck", "leak"):
         fault = {"stuck": "pressure sensor stuck", "leak": "leak"}[name]
-        matrix_row(29, fault=f"{fault}: vent begins", tries=tries, limit="2.1 s", worst=f"{found[name] / 1000:.3f} s",
-                   clock="emulated")  # fmt: skip
+        matrix_row(
+            29,
+            fault=f"{fault}: vent begins",
+            tries=tries,
+            limit="2.1 s",
+            worst=f"{found[name] / 1000:.3f} s",
+            clock="emulated",
+        )
     assert found["over-pressure"] <= 110
     assert max(found["stuck"], found["leak"]) <= 2100
 
@@ -254,8 +296,14 @@ def test_row_30_host_does_not_read(matrix_row, full):
 
     tries = 2
     jitter, awake = worst(side_by_side(tries, attempt, AT_ONCE))
-    matrix_row(30, fault=f"host does not read, {seconds} s", tries=tries, limit="loop jitter below 2 ms",
-               worst=f"outputs {jitter:.2f} ms late, longest pass {awake:.2f} ms", clock="emulated")  # fmt: skip
+    matrix_row(
+        30,
+        fault=f"host does not read, {seconds} s",
+        tries=tries,
+        limit="loop jitter below 2 ms",
+        worst=f"outputs {jitter:.2f} ms late, longest pass {awake:.2f} ms",
+        clock="emulated",
+    )
     assert jitter < 2.0
     assert awake < 2.0
 

@@ -73,9 +73,14 @@ def test_row_25_disk_full(matrix_row, full, tmp_path):
     writer.close()
     assert (len(found), found[:201]) == (steps + 1, sound)
     assert lost >= 100
-    matrix_row(25, fault="disk full, or hanging, while logging", tries=tries + 1,
-               limit="control goes on, no late tick, the log says so", worst=f"same commands, {untold} untold",
-               clock="virtual")  # fmt: skip
+    matrix_row(
+        25,
+        fault="disk full, or hanging, while logging",
+        tries=tries + 1,
+        limit="control goes on, no late tick, the log says so",
+        worst=f"same commands, {untold} untold",
+        clock="virtual",
+    )
     assert untold == 0
 
 
@@ -101,9 +106,14 @@ def test_row_25_disk_full_in_a_run(matrix_row, full, model_file, tmp_path):
             return float(re.search(r"tick lateness: .*largest ([\d.]+) ms", run.said)[1])
 
     worst_ms = max(side_by_side(len(phases_s), attempt, 3))
-    matrix_row(25, fault="no room for the log, in a run", tries=len(phases_s),
-               limit="control goes on, no tick missed, the terminal says so",
-               worst=f"15 of 15 steps, latest tick {worst_ms:.1f} ms", clock="host")  # fmt: skip
+    matrix_row(
+        25,
+        fault="no room for the log, in a run",
+        tries=len(phases_s),
+        limit="control goes on, no tick missed, the terminal says so",
+        worst=f"15 of 15 steps, latest tick {worst_ms:.1f} ms",
+        clock="host",
+    )
 
 
 # ---- Row 26
@@ -155,9 +165,14 @@ def test_row_26_starved_processor(matrix_row, full):
         silent = longest_silence(world.ticks)
         assert silent <= MISSED_IN_A_ROW or "control ticks in a row were missed" in reason
         ended += "control ticks in a row were missed" in reason
-    matrix_row(26, fault="starved processor, late ticks", tries=sets,
-               limit="two SETs never less than 0.2 s apart; more than two missed: vent",
-               worst=f"{least_s:.3f} s; {ended} of {tries} runs ended", clock="virtual")  # fmt: skip
+    matrix_row(
+        26,
+        fault="starved processor, late ticks",
+        tries=sets,
+        limit="two SETs never less than 0.2 s apart; more than two missed: vent",
+        worst=f"{least_s:.3f} s; {ended} of {tries} runs ended",
+        clock="virtual",
+    )
     assert least_s >= PERIOD_S / 2 - 1e-9
     assert 0.05 * tries < ended < 0.95 * tries
 
@@ -207,7 +222,13 @@ def test_row_27_wall_clock_steps(matrix_row, full, model_file, tmp_path, steppin
     results = side_by_side(tries + 1, attempt, 3)
     (calm, _), *others = results
     differ = sum(a != b for commands, _ in others for a, b in zip(commands, calm, strict=True))
-    matrix_row(27, fault="wall clock steps by up to an hour, three times a second", tries=sum(n for _, n in others),
-               limit="commands identical", worst=f"{differ} of {tries * steps} differ", clock="host")  # fmt: skip
+    matrix_row(
+        27,
+        fault="wall clock steps by up to an hour, three times a second",
+        tries=sum(n for _, n in others),
+        limit="commands identical",
+        worst=f"{differ} of {tries * steps} differ",
+        clock="host",
+    )
     assert differ == 0
     assert len({str(bar) for bar in calm}) > steps / 2, "commands that never change show nothing"

@@ -63,8 +63,14 @@ def test_rows_13_14_15_18_19_tracker_in_trouble_on_the_line(matrix_row, full, mo
     for name, (_, row, _, _) in FAULTS.items():
         limit_s = LATER_LIMITS_S.get(name, LIMIT_S)
         worst_s = max(took for told, took in zip(attempts, took_s, strict=True) if told == name)
-        matrix_row(row, fault=f"{name}, on the line", tries=tries, limit=f"vent begins within {limit_s:.2f} s",
-                   worst=f"{worst_s:.2f} s", clock="host")  # fmt: skip
+        matrix_row(
+            row,
+            fault=f"{name}, on the line",
+            tries=tries,
+            limit=f"vent begins within {limit_s:.2f} s",
+            worst=f"{worst_s:.2f} s",
+            clock="host",
+        )
         late += [name] if worst_s > limit_s else []
     assert late == []
 
@@ -84,5 +90,11 @@ def test_row_18_one_bad_moment_is_waited_out_on_the_line(matrix_row, model_file,
     held = [line for line in log.ticks if line["verdict"] != "good"]
     assert 3 <= len(held) <= 6
     assert log.meta["figures"]["held"] == {"tool hidden": len(held)}
-    matrix_row(18, fault="a marker hidden for a moment, on the line", tries=3, limit="waited out, command held",
-               worst=f"{len(held)} ticks held", clock="host")  # fmt: skip
+    matrix_row(
+        18,
+        fault="a marker hidden for a moment, on the line",
+        tries=3,
+        limit="waited out, command held",
+        worst=f"{len(held)} ticks held",
+        clock="host",
+    )

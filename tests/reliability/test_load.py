@@ -74,9 +74,14 @@ def test_row_26_one_core_with_four_busy_processes(matrix_row, full, strong_model
     assert figures["missed"] == sum(line["missed"] + (not line["sent"]) for line in log.ticks)
     p50, p99 = np.percentile(late_ms, [50, 99], method="higher")
     late = f"late {p50:.1f} ms (median), {p99:.1f} ms (p99), {late_ms.max():.1f} ms (largest)"
-    matrix_row(26, fault=f"one core, {BUSY} busy processes beside", tries=len(log.ticks),
-               limit="two SETs never less than 0.2 s apart; every lateness logged; more than two missed: vent",
-               worst=f"{gap_s:.3f} s; {late}; {figures['missed']} missed, exit code {code}", clock="host")  # fmt: skip
+    matrix_row(
+        26,
+        fault=f"one core, {BUSY} busy processes beside",
+        tries=len(log.ticks),
+        limit="two SETs never less than 0.2 s apart; every lateness logged; more than two missed: vent",
+        worst=f"{gap_s:.3f} s; {late}; {figures['missed']} missed, exit code {code}",
+        clock="host",
+    )
 
 
 # ---- The runtime halted
@@ -147,9 +152,20 @@ def test_row_26_halted_for_50_to_600_ms(matrix_row, full, strong_model, tmp_path
     late_ms = max(late for *_, late, _ in results)
     assert gone_on
     assert vented_ms
-    matrix_row(26, fault="runtime halted for 50 to 600 ms", tries=len(results),
-               limit="two SETs never less than 0.2 s apart; every lateness logged", clock="host",
-               worst=f"{gap_s:.3f} s; a tick {late_ms:.0f} ms late; {len(gone_on)} went on, halted for up to "
-                     f"{1e3 * max(gone_on):.0f} ms")  # fmt: skip
-    matrix_row(11, fault="runtime halted for 50 to 600 ms: the board vents when it must", tries=len(vented_ms),
-               limit=f"{VENTED_MS} ms", worst=f"{max(vented_ms):.0f} ms", clock="emulated")  # fmt: skip
+    matrix_row(
+        26,
+        fault="runtime halted for 50 to 600 ms",
+        tries=len(results),
+        limit="two SETs never less than 0.2 s apart; every lateness logged",
+        clock="host",
+        worst=f"{gap_s:.3f} s; a tick {late_ms:.0f} ms late; {len(gone_on)} went on, halted for up to "
+        f"{1e3 * max(gone_on):.0f} ms",
+    )
+    matrix_row(
+        11,
+        fault="runtime halted for 50 to 600 ms: the board vents when it must",
+        tries=len(vented_ms),
+        limit=f"{VENTED_MS} ms",
+        worst=f"{max(vented_ms):.0f} ms",
+        clock="emulated",
+    )

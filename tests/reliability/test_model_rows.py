@@ -25,9 +25,19 @@ def refusal(model, port, runs):
     """What a run with this model file says, and after how many seconds."""
     began_s = time.perf_counter()
     options = session.Options(
-        robot="pneumatic-3", model=model, task="down", correction="none", port=port, tracker="",
-        tracker_port="/dev/null", tools=(), runs=runs, steps=None, yes=True, dry_run=False,
-    )  # fmt: skip
+        robot="pneumatic-3",
+        model=model,
+        task="down",
+        correction="none",
+        port=port,
+        tracker="",
+        tracker_port="/dev/null",
+        tools=(),
+        runs=runs,
+        steps=None,
+        yes=True,
+        dry_run=False,
+    )
     with pytest.raises(ModelError) as refused:
         session.run(options)
     return str(refused.value), time.perf_counter() - began_s
@@ -54,8 +64,14 @@ def test_row_20_damaged_model_file(matrix_row, full, model_file, tmp_path):
             worst_s = max(worst_s, took_s)
         assert untouched(board)
     assert not (tmp_path / "runs").exists()
-    matrix_row(20, fault="damaged model file", tries=tries, limit="refused in 2 s, port never opened, 0 bytes",
-               worst=f"all, {worst_s * 1e3:.0f} ms", clock="host")  # fmt: skip
+    matrix_row(
+        20,
+        fault="damaged model file",
+        tries=tries,
+        limit="refused in 2 s, port never opened, 0 bytes",
+        worst=f"all, {worst_s * 1e3:.0f} ms",
+        clock="host",
+    )
     assert worst_s <= LIMIT_S
 
 
@@ -77,8 +93,14 @@ def test_row_20_damaged_model_file_from_the_command_line(matrix_row, full, model
             worst_s = max(worst_s, processor_s() - began_s)  # it waits for nothing, and others may be busy here
             assert (done.returncode, len(done.stderr.splitlines())) == (65, 1), done.stderr
         assert untouched(board)
-    matrix_row(20, fault="damaged model file, the whole command", tries=tries, limit="exit 65 in 2 s, 0 bytes",
-               worst=f"all, {worst_s:.2f} s of one core", clock="host")  # fmt: skip
+    matrix_row(
+        20,
+        fault="damaged model file, the whole command",
+        tries=tries,
+        limit="exit 65 in 2 s, 0 bytes",
+        worst=f"all, {worst_s:.2f} s of one core",
+        clock="host",
+    )
     assert worst_s <= LIMIT_S
 
 
@@ -112,8 +134,13 @@ def test_row_21_model_of_another_robot(matrix_row, make_checkpoint, model_file, 
         assert "trained for kind cable, state size 3, action size 2, period_s 1.0" in said
         assert "has kind pneumatic, state size 2, action size 1, period_s 0.4" in said
         assert untouched(board)
-    matrix_row(21, fault=f"model of another {', '.join(OTHERS)}; of the cable robot", tries=len(OTHERS) + 1,
-               limit="refused, the message names expected and found", worst="all")  # fmt: skip
+    matrix_row(
+        21,
+        fault=f"model of another {', '.join(OTHERS)}; of the cable robot",
+        tries=len(OTHERS) + 1,
+        limit="refused, the message names expected and found",
+        worst="all",
+    )
 
 
 def test_row_22_model_gives_nan(matrix_row, full):
@@ -127,8 +154,14 @@ def test_row_22_model_gives_nan(matrix_row, full):
             world.run()
         assert len(world.sent) == step  # actuation 0 and the steps before
         assert all(np.isfinite(bar).all() for *_, bar in world.sent)
-    matrix_row(22, fault="model gives NaN, infinity or what is far out of range", tries=tries,
-               limit="0 sent, fault, vent", worst="0 sent", clock="virtual")  # fmt: skip
+    matrix_row(
+        22,
+        fault="model gives NaN, infinity or what is far out of range",
+        tries=tries,
+        limit="0 sent, fault, vent",
+        worst="0 sent",
+        clock="virtual",
+    )
 
 
 @pytest.mark.realtime
@@ -152,5 +185,11 @@ def test_row_22_model_gives_nan_on_the_board(matrix_row, full, model_file, tmp_p
         assert run.closed_ns() < log.events[-1]["vented_ns"]
 
     side_by_side(len(values), attempt, 4)
-    matrix_row(22, fault="model goes wild in mid-run, on the board", tries=len(values), limit="0 sent, exit 65, vented",
-               worst="0 sent, all vented", clock="host")  # fmt: skip
+    matrix_row(
+        22,
+        fault="model goes wild in mid-run, on the board",
+        tries=len(values),
+        limit="0 sent, exit 65, vented",
+        worst="0 sent, all vented",
+        clock="host",
+    )

@@ -58,8 +58,14 @@ def test_row_07_plugged_in_again_under_another_name(matrix_row, tmp_path, monkey
 
     tries = 20
     idle_s = max(side_by_side(tries, attempt, 2))
-    matrix_row(7, fault="plugged in again under another name", tries=tries, limit="IDLE in 8 s, 20 of 20",
-               worst=f"{idle_s:.2f} s", clock="emulated")  # fmt: skip
+    matrix_row(
+        7,
+        fault="plugged in again under another name",
+        tries=tries,
+        limit="IDLE in 8 s, 20 of 20",
+        worst=f"{idle_s:.2f} s",
+        clock="emulated",
+    )
     assert idle_s <= 8
 
 
@@ -98,8 +104,13 @@ def test_row_07_the_next_run_finds_the_board_by_its_serial_number(matrix_row, mo
         with Run(stand, model_file, tmp_path / "third", "--port", number, "--steps", "3", program=here) as run:
             assert run.left()[0] == 0, run.said
         assert run.log().meta["port"] == elsewhere
-    matrix_row(7, fault="plugged in again under another name: the next run", tries=1,
-               limit="74; 69 and where the board is; then found by --port SERIAL", worst="as it must")  # fmt: skip
+    matrix_row(
+        7,
+        fault="plugged in again under another name: the next run",
+        tries=1,
+        limit="74; 69 and where the board is; then found by --port SERIAL",
+        worst="as it must",
+    )
 
 
 def mega(serial_number, device):
@@ -132,8 +143,14 @@ def test_row_09_host_would_talk_to_the_bootloader(matrix_row):
         return emulated.summary["rx_bootloader"]
 
     found = sum(side_by_side(5, attempt, 2))
-    matrix_row(9, fault="host would talk to the bootloader", tries=5 * opens, limit="0 bytes in 100 opens",
-               worst=f"{found} bytes", clock="none")  # fmt: skip
+    matrix_row(
+        9,
+        fault="host would talk to the bootloader",
+        tries=5 * opens,
+        limit="0 bytes in 100 opens",
+        worst=f"{found} bytes",
+        clock="none",
+    )
     assert found == 0
 
 
@@ -239,12 +256,23 @@ def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypat
         monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [mute])
         refused("of a mute device of another maker", name, DeviceAbsent, 69)
     worst = max(took_s, key=took_s.get)
-    matrix_row(24, fault=f"port {', '.join(took_s)}", tries=len(took_s), limit="own exit code in 3 s, no retry storm",
-               worst=f"{took_s[worst]:.2f} s ({worst}), opened once each", clock="host")  # fmt: skip
+    matrix_row(
+        24,
+        fault=f"port {', '.join(took_s)}",
+        tries=len(took_s),
+        limit="own exit code in 3 s, no retry storm",
+        worst=f"{took_s[worst]:.2f} s ({worst}), opened once each",
+        clock="host",
+    )
     mute_s, resets = given_up_when_mute()
-    matrix_row(24, fault="port of a mute device that may be our board", tries=1,
-               limit="three resets first, 3 s for each", worst=f"{mute_s:.1f} s, {resets} resets",
-               clock="virtual")  # fmt: skip
+    matrix_row(
+        24,
+        fault="port of a mute device that may be our board",
+        tries=1,
+        limit="three resets first, 3 s for each",
+        worst=f"{mute_s:.1f} s, {resets} resets",
+        clock="virtual",
+    )
     assert took_s[worst] <= 3.0
     assert (mute_s, resets) == (pytest.approx(12.3, abs=0.2), 3)
 

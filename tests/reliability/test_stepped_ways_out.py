@@ -60,14 +60,22 @@ def test_row_12_every_way_out_vents_at_any_phase(name, matrix_row, full, tmp_pat
             assert len(told) == 1
             assert word in told[0][1]
             assert told[0][0] == 0.0 or not can_say, "said while a valve was open"
-            [end] = [json.loads(line) for line in (run.log.folder / "run.jsonl").read_text().splitlines()
-                     if '"event":"end"' in line]  # fmt: skip
+            [end] = [
+                json.loads(line)
+                for line in (run.log.folder / "run.jsonl").read_text().splitlines()
+                if '"event":"end"' in line
+            ]
             assert (end["exit_code"], end["vented"]) == (code, can_say)
             opened = rises(emulated.trace) > 0
             pressed += opened
             if opened:
                 worst_s = max(worst_s, vented_us(emulated.trace) * 1e-6 - run.caused_s)
-    matrix_row(12, fault=f"{name}, at any phase", tries=tries, clock="emulated",
-               limit=f'at 0, "vented" {"said after the board said so" if can_say else "never said"}, exit {code}',
-               worst=f"all; {pressed} under pressure: at 0 after {worst_s:.3f} s")  # fmt: skip
+    matrix_row(
+        12,
+        fault=f"{name}, at any phase",
+        tries=tries,
+        clock="emulated",
+        limit=f'at 0, "vented" {"said after the board said so" if can_say else "never said"}, exit {code}',
+        worst=f"all; {pressed} under pressure: at 0 after {worst_s:.3f} s",
+    )
     assert pressed >= tries / 2

@@ -59,8 +59,14 @@ def test_row_13_tracker_off(matrix_row, full):
         world.dark.append((world.time_s + rng.uniform(PERIOD_S, RUN_S), np.inf))
         worst_s = max(worst_s, ended(world))
         held(world)
-    matrix_row(13, fault="tracker off", tries=tries, limit="vent 1.25 s after the last good frame",
-               worst=f"{worst_s:.3f} s", clock="virtual")  # fmt: skip
+    matrix_row(
+        13,
+        fault="tracker off",
+        tries=tries,
+        limit="vent 1.25 s after the last good frame",
+        worst=f"{worst_s:.3f} s",
+        clock="virtual",
+    )
     assert worst_s <= VENT_LIMIT_S
     ticks = most = 0
     for _ in range(tries // 10):
@@ -71,8 +77,14 @@ def test_row_13_tracker_off(matrix_row, full):
         world.run()
         most, ticks = max(most, held(world)), ticks + len(world.ticks)
         assert len(world.sent) == 51
-    matrix_row(13, fault="tracker intermittent, up to 0.8 s", tries=ticks, limit="command held, run goes on",
-               worst=f"{most} of 50 ticks held", clock="virtual")  # fmt: skip
+    matrix_row(
+        13,
+        fault="tracker intermittent, up to 0.8 s",
+        tries=ticks,
+        limit="command held, run goes on",
+        worst=f"{most} of 50 ticks held",
+        clock="virtual",
+    )
     assert most >= 5
 
 
@@ -87,8 +99,14 @@ def test_row_14_tracker_frozen(matrix_row, full):
         worst_s = max(worst_s, ended(world))
         used = [line for line in world.ticks if line["verdict"] == "good" and line["frame"]["number"] == number]
         worst = max(worst, len(used) + 1)
-    matrix_row(14, fault="tracker frozen, the same frame again", tries=tries, limit="found within 3 ticks",
-               worst=f"tick {worst}, vent after {worst_s:.3f} s", clock="virtual")  # fmt: skip
+    matrix_row(
+        14,
+        fault="tracker frozen, the same frame again",
+        tries=tries,
+        limit="found within 3 ticks",
+        worst=f"tick {worst}, vent after {worst_s:.3f} s",
+        clock="virtual",
+    )
     assert worst <= 3
     assert worst_s <= VENT_LIMIT_S
 
@@ -99,8 +117,14 @@ def test_row_14_tracker_frozen(matrix_row, full):
         world.frame = lambda drift=drift, world=world: noise(rng, world.time_s, drift)
         world.run()
     alarms = len(verdicts) - verdicts.count("good")
-    matrix_row(14, fault="none: noise of 0.5 mm and 0.5 degrees, jitter of the line, clocks 100 ppm apart",
-               tries=len(verdicts), limit=f"no false alarm in {hours} h", worst=alarms, clock="virtual")  # fmt: skip
+    matrix_row(
+        14,
+        fault="none: noise of 0.5 mm and 0.5 degrees, jitter of the line, clocks 100 ppm apart",
+        tries=len(verdicts),
+        limit=f"no false alarm in {hours} h",
+        worst=alarms,
+        clock="virtual",
+    )
     assert alarms == 0
 
 
@@ -131,9 +155,14 @@ def test_row_15_delayed(matrix_row, full):
             assert number / 60 > seen_s, "an older frame after a newer one"
             used, seen_s = used + 1, number / 60
             worst_s = max(worst_s, on_line_s + in_device_s)
-    matrix_row(15, fault="frames delayed by up to 3 s, on the line and in the device", tries=tries,
-               limit="0 older than a period (0.4 s) used", worst=f"0; oldest of {used} used {worst_s:.3f} s",
-               clock="virtual")  # fmt: skip
+    matrix_row(
+        15,
+        fault="frames delayed by up to 3 s, on the line and in the device",
+        tries=tries,
+        limit="0 older than a period (0.4 s) used",
+        worst=f"0; oldest of {used} used {worst_s:.3f} s",
+        clock="virtual",
+    )
     assert worst_s <= PERIOD_S
     assert used > 0.3 * tries
 
@@ -160,8 +189,14 @@ def test_row_16_nan(matrix_row, full):
     assert refused >= 0.99 * tries
     assert counts.count("good") == len(counts) - refused == len(world.features)
     reached = sum(not np.isfinite(features).all() for features in world.features)
-    matrix_row(16, fault="NaN and infinity in poses that call themselves valid", tries=refused,
-               limit="0 reach the model", worst=reached, clock="virtual")  # fmt: skip
+    matrix_row(
+        16,
+        fault="NaN and infinity in poses that call themselves valid",
+        tries=refused,
+        limit="0 reach the model",
+        worst=reached,
+        clock="virtual",
+    )
     assert reached == 0
     assert all(np.isfinite(bar).all() for *_, bar in world.sent)
 
@@ -184,8 +219,14 @@ def test_row_17_outlier(matrix_row, full):
         worst = max(worst, len(refused))
         used = [line["configuration"] for line in world.ticks if line["verdict"] == "good"]
         assert np.all(bending_angle_deg(used) == 0.0)
-    matrix_row(17, fault="a frame that jumps by more than the fastest motion", tries=tries,
-               limit="command held on that tick, back within 3", worst=f"after {worst}", clock="virtual")  # fmt: skip
+    matrix_row(
+        17,
+        fault="a frame that jumps by more than the fastest motion",
+        tries=tries,
+        limit="command held on that tick, back within 3",
+        worst=f"after {worst}",
+        clock="virtual",
+    )
     assert worst <= 3
 
 
@@ -228,9 +269,14 @@ def test_row_18_hidden_wrong_number_swapped(matrix_row, full):
         assert world.ticks[-3:] == bad
         held(world)
     assert kinds == {"hidden", "wrong number", "swapped"}
-    matrix_row(18, fault="tools hidden, of a wrong number, in any wrong order", tries=tries,
-               limit="no partial state used; vent 1.25 s after the last good frame", worst=f"0; {worst_s:.3f} s",
-               clock="virtual")  # fmt: skip
+    matrix_row(
+        18,
+        fault="tools hidden, of a wrong number, in any wrong order",
+        tries=tries,
+        limit="no partial state used; vent 1.25 s after the last good frame",
+        worst=f"0; {worst_s:.3f} s",
+        clock="virtual",
+    )
     assert worst_s <= VENT_LIMIT_S
 
 
@@ -252,8 +298,14 @@ def test_row_19_numbers_backwards(matrix_row, full):
             last = seen.device_frame
     assert slot.counts["repeated"] + slot.counts["backwards"] == dropped
     assert sum(slot.counts.values()) == tries
-    matrix_row(19, fault="frame numbers that go backwards", tries=dropped, limit="0 used, each counted", worst=used,
-               clock="virtual")  # fmt: skip
+    matrix_row(
+        19,
+        fault="frame numbers that go backwards",
+        tries=dropped,
+        limit="0 used, each counted",
+        worst=used,
+        clock="virtual",
+    )
     assert used == 0
     assert dropped > 0.3 * tries
     assert last > 0.99 * newest

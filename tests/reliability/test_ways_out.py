@@ -88,9 +88,14 @@ def test_row_12_every_way_out_vents(matrix_row, full, model_file, tmp_path):
         vented_s = [vented for told, vented, _ in results if told == name and vented is not None]
         left_s = max(left for told, _, left in results if told == name)
         word = "said after the board said so" if can_say else "never said"
-        matrix_row(12, fault=f"{name}, at a random phase", tries=tries, limit=f'at 0, "vented" {word}, exit {code}',
-                   worst=f"all; {len(vented_s)} under pressure: at 0 after {max(vented_s):.2f} s, left after "
-                         f"{left_s:.2f} s", clock="host")  # fmt: skip
+        matrix_row(
+            12,
+            fault=f"{name}, at a random phase",
+            tries=tries,
+            limit=f'at 0, "vented" {word}, exit {code}',
+            worst=f"all; {len(vented_s)} under pressure: at 0 after {max(vented_s):.2f} s, left after {left_s:.2f} s",
+            clock="host",
+        )
         assert len(vented_s) >= tries / 2
 
 
@@ -113,8 +118,13 @@ def test_row_12_nobody_says_vented_for_a_board_that_is_not_heard(matrix_row, mod
             assert (end["vented"], end["vented_ns"]) == (False, None)
 
     side_by_side(len(names), attempt, AT_ONCE)
-    matrix_row(12, fault="each of these, and the board is not heard any more", tries=len(names),
-               limit='"vented" never said, same exit code', worst="never said")  # fmt: skip
+    matrix_row(
+        12,
+        fault="each of these, and the board is not heard any more",
+        tries=len(names),
+        limit='"vented" never said, same exit code',
+        worst="never said",
+    )
 
 
 def test_row_12_a_signal_before_arming_opens_no_valve(matrix_row, full, model_file, tmp_path):
@@ -137,8 +147,14 @@ def test_row_12_a_signal_before_arming_opens_no_valve(matrix_row, full, model_fi
             return took_s
 
     worst_s = max(side_by_side(len(attempts), attempt, AT_ONCE))
-    matrix_row(12, fault="a signal before arming", tries=len(attempts), limit="no valve opens, exit code of the signal",
-               worst=f"none; left after {worst_s:.2f} s", clock="host")  # fmt: skip
+    matrix_row(
+        12,
+        fault="a signal before arming",
+        tries=len(attempts),
+        limit="no valve opens, exit code of the signal",
+        worst=f"none; left after {worst_s:.2f} s",
+        clock="host",
+    )
 
 
 # ---- Row 11: the host stands still
@@ -173,8 +189,14 @@ def test_row_11_host_stands_still(name, matrix_row, full, strong_model, tmp_path
             return took_ms
 
     worst_ms = max(side_by_side(len(phases_s), attempt, 4))
-    matrix_row(11, fault=name, tries=len(phases_s), limit=f"all 0 in {limit_ms} ms, never opened again",
-               worst=f"{worst_ms:.0f} ms", clock="emulated")  # fmt: skip
+    matrix_row(
+        11,
+        fault=name,
+        tries=len(phases_s),
+        limit=f"all 0 in {limit_ms} ms, never opened again",
+        worst=f"{worst_ms:.0f} ms",
+        clock="emulated",
+    )
     assert worst_ms <= limit_ms
 
 
@@ -203,8 +225,14 @@ def test_row_11_the_fault_stays_latched_for_a_host_that_comes_back(fault, error,
             beat_for(host, 1.0)
             assert (host.board.status.state, host.board.status.faults) == (State.FAULT, fault)
             assert rises(emulated.trace, since) == 0
-    matrix_row(11, fault=f"host comes back after {fault.name}", tries=tries, limit="fault latched, nothing opens",
-               worst="all latched", clock="emulated")  # fmt: skip
+    matrix_row(
+        11,
+        fault=f"host comes back after {fault.name}",
+        tries=tries,
+        limit="fault latched, nothing opens",
+        worst="all latched",
+        clock="emulated",
+    )
 
 
 # ---- Row 12, by hand

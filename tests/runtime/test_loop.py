@@ -341,9 +341,17 @@ def test_a_rehearsal_runs_the_task_without_a_board():
     world = World(steps=5)
     loop = world.loop
     Loop(
-        loop.robot, loop.model, loop.desired, loop.slot, loop.judge, Rehearsal(), loop.ticker, loop.stop, loop.log,
+        loop.robot,
+        loop.model,
+        loop.desired,
+        loop.slot,
+        loop.judge,
+        Rehearsal(),
+        loop.ticker,
+        loop.stop,
+        loop.log,
         loop.tally,
-    ).run(REST)  # fmt: skip
+    ).run(REST)
     assert world.sent == []
     assert len(world.ticks) == 5
     assert world.ticks[0]["board"] is None

@@ -31,9 +31,14 @@ entry(cli)()
 
 def run(code, cwd, **environment):
     return subprocess.run(
-        [sys.executable, "-P", "-c", code], cwd=cwd, capture_output=True, text=True, timeout=60, check=False,
+        [sys.executable, "-P", "-c", code],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
         env={name: value for name, value in {**os.environ, **environment}.items() if value is not None},
-    )  # fmt: skip
+    )
 
 
 def test_children_import_nothing_from_the_current_folder(tmp_path):
@@ -164,9 +169,15 @@ def test_a_control_run_writes_nothing_below_the_home(model_file, tmp_path):
     environment = {**os.environ, "HOME": str(home), "USERPROFILE": str(home)}
     environment.pop("ORT_DISABLE_TELEMETRY", None)
     done = subprocess.run(
-        [SCRIPTS / "modsoft-runtime", *order], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
-        env=environment, stdin=subprocess.DEVNULL,
-    )  # fmt: skip
+        [SCRIPTS / "modsoft-runtime", *order],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+    )
     assert "onnxruntime" in next((tmp_path / "runs").glob("*/meta.json")).read_text(), done.stderr
     assert list(home.rglob("*")) == []
     assert "telemetry" not in done.stderr

@@ -122,6 +122,8 @@ def test_the_command_ends_with_69(tmp_path, model_file):
     command = [Path(sys.executable).with_name("modsoft-runtime"), "--robot", "pneumatic-2", "--model", model_file]
     done = subprocess.run(
         [*command, "--dry-run", "--tracker", "replay", "--tracker-port", tmp_path, "--runs-dir", tmp_path / "runs"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert (done.returncode, len(done.stderr.splitlines())) == (69, 1), done.stderr

@@ -11,9 +11,13 @@ from modsoft.runtime.errors import RobotFileError
 
 @pytest.mark.parametrize(
     ("name", "kind", "modules", "state", "action"),
-    [("cable-4", "cable", 4, 3, 2), ("cable-6", "cable", 6, 3, 2), ("pneumatic-2", "pneumatic", 2, 2, 1),
-     ("pneumatic-3", "pneumatic", 3, 2, 1)],
-)  # fmt: skip
+    [
+        ("cable-4", "cable", 4, 3, 2),
+        ("cable-6", "cable", 6, 3, 2),
+        ("pneumatic-2", "pneumatic", 2, 2, 1),
+        ("pneumatic-3", "pneumatic", 3, 2, 1),
+    ],
+)
 def test_shipped_robots(name, kind, modules, state, action):
     robot = robots.load(name)
     assert (robot.name, robot.robot.kind, robot.modules) == (name, kind, modules)
@@ -71,33 +75,44 @@ PNEUMATIC = robots.text_of("pneumatic-3")
         (PNEUMATIC.replace("hz = 2.5", "hzz = 2.5"), r"'hzz' under \[loop\], did you mean 'hz'\?; .* hz, task$"),
         (PNEUMATIC.replace("hz = 2.5", 'hz = "fast"'), r"hz under \[loop\]: found 'fast'; expected a number above 0"),
         (PNEUMATIC.replace("hz = 2.5", "hz = 0.0"), r"hz under \[loop\]: found 0.0; .* above 0 and at most 100$"),
-        (PNEUMATIC.replace('"pneumatic"', '"pneumatics"'),
-         r"kind under \[robot\]: found 'pneumatics', did you mean 'pneumatic'\?; .* one of 'cable', 'pneumatic'$"),
+        (
+            PNEUMATIC.replace('"pneumatic"', '"pneumatics"'),
+            r"kind under \[robot\]: found 'pneumatics', did you mean 'pneumatic'\?; .* one of 'cable', 'pneumatic'$",
+        ),
         (PNEUMATIC.replace('"0-10 V"', '"4-20 mA"'), r"signal under \[valve\]: found '4-20 mA'; expected '0-10 V'$"),
         (PNEUMATIC.replace("baud = 250000", "baud = 9600"), "found 9600; expected one of 115200, 250000"),
-        (PNEUMATIC.replace("modules = 3", "modules = 1"),
-         r"modules under \[robot\]: found 1; .* at least 2 and at most 64$"),
+        (
+            PNEUMATIC.replace("modules = 3", "modules = 1"),
+            r"modules under \[robot\]: found 1; .* at least 2 and at most 64$",
+        ),
         (PNEUMATIC.replace('name = "pneumatic-3"', 'name = "my arm"'), "found 'my arm'; expected text"),
         (PNEUMATIC.replace("modules = 3", "modules = 2"), "too many: module 3 side [+], module 3 side -; expected"),
         (PNEUMATIC.replace("modules = 3", "modules = 4"), "missing: module 4 side [+], module 4 side -; expected"),
         (PNEUMATIC.replace("tools = []", "tools = [1]"), r"tools number 1 under \[tracker\]: found 1; expected text"),
         (PNEUMATIC.replace("tools = []", "tools = 7"), r"tools under \[tracker\]: found 7; expected a list$"),
-        ("loop = 3\n" + PNEUMATIC.replace("[loop]\nhz", "[limits]\nhz").replace("[limits]\nlargest", "[none]\nlargest"),
-         "loop at the top of the file: found 3; expected a table$"),
-        (PNEUMATIC.replace("full_scale_bar = 3.0 ", "# "),
-         r"full_scale_bar under \[valve\] is missing; add it, expected a number above 0 and at most 10$"),
+        (
+            "loop = 3\n"
+            + PNEUMATIC.replace("[loop]\nhz", "[limits]\nhz").replace("[limits]\nlargest", "[none]\nlargest"),
+            "loop at the top of the file: found 3; expected a table$",
+        ),
+        (
+            PNEUMATIC.replace("full_scale_bar = 3.0 ", "# "),
+            r"full_scale_bar under \[valve\] is missing; add it, expected a number above 0 and at most 10$",
+        ),
         (PNEUMATIC.replace("full_scale_bar = 3.0", "full_scale_bar = 0.3"), "p_min_bar < p_max_bar <= full_scale_bar"),
         (PNEUMATIC.replace("p_min_bar = 0.08", "p_min_bar = 0.5"), "p_min_bar < p_max_bar"),
         (PNEUMATIC.replace("channel = 5", "channel = 4"), "channel 4 is given to two chambers"),
-        (PNEUMATIC.replace("channel = 5", "channel = 12"),
-         r"channel under \[chambers number 6\]: found 12; expected .* at most 11$"),
+        (
+            PNEUMATIC.replace("channel = 5", "channel = 12"),
+            r"channel under \[chambers number 6\]: found 12; expected .* at most 11$",
+        ),
         (PNEUMATIC.replace("tools = []", 'tools = ["a.rom"]'), "4: base, then modules 1 to 3"),
         (PNEUMATIC.replace("[robot]", "[robot"), "not valid TOML"),
         (PNEUMATIC + '\n[colour]\npaint = "red"\n', "colour"),
         (robots.text_of("cable-4") + '\n[valve]\nmodel = "x"\nfull_scale_bar = 3.0\nsignal = "0-10 V"\n', "simulated"),
         (robots.text_of("cable-4").replace('"cable"', '"pneumatic"'), "full_scale_bar"),
     ],
-)  # fmt: skip
+)
 def test_every_mistake_is_one_line_that_names_it(text, expected):
     with pytest.raises(RobotFileError, match=expected) as caught:
         robots.parse(text, "robot.toml")

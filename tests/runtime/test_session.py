@@ -70,9 +70,17 @@ def test_a_board_that_does_not_say_so_is_not_vented(tmp_path, capsys, word):
 
 @pytest.mark.parametrize(
     ("error", "code"),
-    [(Interrupted(2), 130), (Interrupted(15), 143), (Interrupted(1), 129), (ModelError("nan"), 65),
-     (Tripped("limit"), 79), (LostInRun("tracker"), 74), (ValueError("a bug"), 70), (KeyboardInterrupt(), 70)],
-)  # fmt: skip
+    [
+        (Interrupted(2), 130),
+        (Interrupted(15), 143),
+        (Interrupted(1), 129),
+        (ModelError("nan"), 65),
+        (Tripped("limit"), 79),
+        (LostInRun("tracker"), 74),
+        (ValueError("a bug"), 70),
+        (KeyboardInterrupt(), 70),
+    ],
+)
 @pytest.mark.parametrize("word", [True, False])
 def test_what_ended_the_run_is_raised_after_the_venting(tmp_path, capsys, error, code, word):
     board = Board(word)

@@ -54,8 +54,9 @@ def test_the_papers_robots_have_the_papers_tables():
 
 @pytest.mark.parametrize("modules", [2, 3, 5, 7, 8, 12])
 def test_tasks_of_other_robots_are_of_the_papers_shape(modules):
-    spiral, circle, bend = (angles_deg(make(modules)) for make in
-                            (task_tables.spiral, task_tables.circle, task_tables.bend))  # fmt: skip
+    spiral, circle, bend = (
+        angles_deg(make(modules)) for make in (task_tables.spiral, task_tables.circle, task_tables.bend)
+    )
     assert all(np.abs(each).max() < 53.2 for each in (spiral, circle, bend))  # what the paper asks of a module
     assert (np.diff(spiral) >= 0).all()
     if modules > 4:

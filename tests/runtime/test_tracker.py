@@ -104,9 +104,12 @@ def recorded(tmp_path, numbers, period_s=0.4):
         line = {"tick": step, "frame": None}
         if number is not None:
             line["frame"] = {
-                "number": number, "mono_ns": round(step * period_s * 1e9), "poses": seen.poses.tolist(),
-                "valid": seen.valid.tolist(), "quality": [0.1, None, 0.1, 0.1],
-            }  # fmt: skip
+                "number": number,
+                "mono_ns": round(step * period_s * 1e9),
+                "poses": seen.poses.tolist(),
+                "valid": seen.valid.tolist(),
+                "quality": [0.1, None, 0.1, 0.1],
+            }
         lines.append(line)
     text = "\n".join(json.dumps(line) for line in lines)
     (tmp_path / "run.jsonl").write_text(text + '\n{"tick": 9, "fra')

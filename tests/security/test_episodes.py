@@ -98,8 +98,17 @@ def test_results_of_jobs_that_were_there_before_are_not_unpickled(tmp_path, part
             there.mkdir(exist_ok=True)
             (there / "1_0_result.pkl").write_bytes(pickle.dumps(("success", evil)))
         with pytest.raises(InUse, match="caught"):
-            collect.collect(ROBOT, tmp_path / "d.h5", 20, "random", 0, 10, plant=Plant("still", still, 1),
-                            backend="submitit", options={"cluster": "local"})  # fmt: skip
+            collect.collect(
+                ROBOT,
+                tmp_path / "d.h5",
+                20,
+                "random",
+                0,
+                10,
+                plant=Plant("still", still, 1),
+                backend="submitit",
+                options={"cluster": "local"},
+            )
     assert folders[0] != folders[1]
     assert len(folders[1].name) > 32
     assert not list(folders[1].iterdir())
@@ -141,6 +150,7 @@ def test_a_recipe_that_is_none(tmp_path, parts, recipe, refused):
 
 # ---- Two at a time --------------------------------------------------------------------------------------------------
 
+
 def test_two_collections_do_not_work_on_the_same_data_set(tmp_path, parts):
     with Shards(parts).held(tmp_path / "d.h5"):
         with pytest.raises(InUse, match=r"d\.h5: another modsoft-collect works on it") as refused:
@@ -164,9 +174,22 @@ def test_two_collections_do_not_work_on_the_same_data_set(tmp_path, parts):
 def test_a_wrong_order_makes_nothing_and_shows_no_bar(tmp_path, backend, option):
     pytest.importorskip({"local": "numpy", "submitit": "submitit", "dask": "dask_jobqueue"}[backend])
     found = subprocess.run(
-        [sys.executable, "-m", "modsoft.training.collect_cli", "--robot", "pneumatic-2", "--out", "d.h5",
-         "--backend", backend, *(part for each in option.split() for part in ("--backend-option", each))],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "modsoft.training.collect_cli",
+            "--robot",
+            "pneumatic-2",
+            "--out",
+            "d.h5",
+            "--backend",
+            backend,
+            *(part for each in option.split() for part in ("--backend-option", each)),
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert (found.returncode in (2, 69), len(found.stderr.splitlines())) == (True, 1), found.stderr
     assert not list(tmp_path.iterdir())

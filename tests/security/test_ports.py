@@ -92,9 +92,13 @@ def test_dask_listens_to_this_machine_or_to_its_workers_alone(tmp_path, options,
     (tmp_path / "scancel").symlink_to("/bin/true")
     (tmp_path / "script.py").write_text(DASK)
     with subprocess.Popen(
-        [sys.executable, "script.py", options], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        [sys.executable, "script.py", options],
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
         env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"},
-    ) as dask:  # fmt: skip
+    ) as dask:
         assert dask.stdout.readline() == "ready\n"
         found = listening([dask.pid, *descendants(dask.pid)])
         dask.stdin.close()

@@ -19,8 +19,11 @@ NEEDED = {
     "onnx.load": ("load_external_data", False),
 }
 # The one place that each of these stands in, where it is told what it may not do.
-ONLY_IN = {"h5py.File": "training/data/dataset.py", "onnxruntime.InferenceSession": "runtime/control/model.py",
-           "socket.create_server": "tools/hil/polaris.py"}  # fmt: skip
+ONLY_IN = {
+    "h5py.File": "training/data/dataset.py",
+    "onnxruntime.InferenceSession": "runtime/control/model.py",
+    "socket.create_server": "tools/hil/polaris.py",
+}
 
 
 def name_of(node):

@@ -104,11 +104,15 @@ class Run:
         if terminal is not None:
             command = [sys.executable, "-c", OWN_TERMINAL, *command]
         self.process = subprocess.Popen(
-            [*command, "--runs-dir", str(self.runs)], start_new_session=True, text=True, errors="replace",
+            [*command, "--runs-dir", str(self.runs)],
+            start_new_session=True,
+            text=True,
+            errors="replace",
             stdin=subprocess.DEVNULL if terminal is None else terminal,
             stdout=subprocess.DEVNULL if terminal is None else terminal,
-            stderr=subprocess.PIPE if terminal is None else terminal, **how,
-        )  # fmt: skip
+            stderr=subprocess.PIPE if terminal is None else terminal,
+            **how,
+        )
         self.words = []  # (CLOCK_MONOTONIC ns, line)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()

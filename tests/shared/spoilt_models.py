@@ -56,17 +56,26 @@ def running_wild(model_file, path, value, beyond):
         for index, name in enumerate(node.output):
             if name == model_files.ACTUATION:
                 node.output[index] = "tame"
-    constants = {"beyond": np.float32(beyond), "wild": np.float32(value), "three": np.int64([3]),
-                 "one": np.int64([1]), "two": np.int64([2]), "zero": np.int64([0]), "last": np.int64([-1])}  # fmt: skip
+    constants = {
+        "beyond": np.float32(beyond),
+        "wild": np.float32(value),
+        "three": np.int64([3]),
+        "one": np.int64([1]),
+        "two": np.int64([2]),
+        "zero": np.int64([0]),
+        "last": np.int64([-1]),
+    }
     graph.initializer.extend(numpy_helper.from_array(np.asarray(array), name) for name, array in constants.items())
-    graph.node.extend([
-        helper.make_node("Shape", [model_files.FEATURES], ["shape"]),
-        helper.make_node("Slice", ["shape", "one", "two"], ["modules"]),
-        helper.make_node("Equal", ["modules", "three"], ["are_three"]),
-        helper.make_node("Slice", [model_files.FEATURES, "zero", "last", "two"], ["unlabelled"]),
-        helper.make_node("ReduceMax", ["unlabelled"], ["largest"], keepdims=0),
-        helper.make_node("Greater", ["largest", "beyond"], ["is_beyond"]),
-        helper.make_node("And", ["are_three", "is_beyond"], ["is_wild"]),
-        helper.make_node("Where", ["is_wild", "wild", "tame"], [model_files.ACTUATION]),
-    ])  # fmt: skip
+    graph.node.extend(
+        [
+            helper.make_node("Shape", [model_files.FEATURES], ["shape"]),
+            helper.make_node("Slice", ["shape", "one", "two"], ["modules"]),
+            helper.make_node("Equal", ["modules", "three"], ["are_three"]),
+            helper.make_node("Slice", [model_files.FEATURES, "zero", "last", "two"], ["unlabelled"]),
+            helper.make_node("ReduceMax", ["unlabelled"], ["largest"], keepdims=0),
+            helper.make_node("Greater", ["largest", "beyond"], ["is_beyond"]),
+            helper.make_node("And", ["are_three", "is_beyond"], ["is_wild"]),
+            helper.make_node("Where", ["is_wild", "wild", "tame"], [model_files.ACTUATION]),
+        ]
+    )
     return sealed_at(path, model, onnx_description(model))

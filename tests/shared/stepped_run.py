@@ -81,8 +81,9 @@ class SteppedRun:
                     judge = FrameJudge(ROBOT)
                     rest = session._rest(self.slot, judge, self.stop, self.clock, LostInRun)
                     ticker = Ticker(PERIOD_S, self.clock, self.wait)
-                    Loop(ROBOT, self, desired, self.slot, judge, self.board, ticker, self.stop, self.log.put, self.tally
-                         ).run(rest)  # fmt: skip
+                    Loop(
+                        ROBOT, self, desired, self.slot, judge, self.board, ticker, self.stop, self.log.put, self.tally
+                    ).run(rest)
                 except BaseException as raised:  # noqa: BLE001 - as in the session itself
                     error = raised
                 with contextlib.closing(self.board):

@@ -106,11 +106,15 @@ class Storm:
 
     def random_frame(self):
         """Some good frame, whose content would be seen if it were taken."""
-        message = self.random.choice((
-            Set(self.tick + 1, (*(self.random.randrange(3501) for _ in range(11)), 0)),
-            Heartbeat(self.tick + 1), Vent(self.random.randrange(2)), ClearFault(0),
-            Arm(protocol.PROTOCOL_HASH, self.hello.boot_id, self.session, 1, 5),
-        ))  # fmt: skip
+        message = self.random.choice(
+            (
+                Set(self.tick + 1, (*(self.random.randrange(3501) for _ in range(11)), 0)),
+                Heartbeat(self.tick + 1),
+                Vent(self.random.randrange(2)),
+                ClearFault(0),
+                Arm(protocol.PROTOCOL_HASH, self.hello.boot_id, self.session, 1, 5),
+            )
+        )
         return encode(message, (self.seq + 1) & 0xFF, self.session)
 
     def damaged(self, kind):

@@ -92,10 +92,17 @@ class World:
         desired = from_angles_deg(np.outer(np.arange(steps), [1.0, 2.0, -3.0][: robot.modules]))
         self.tally = Tally(robot, steps)
         self.loop = Loop(
-            robot, self, desired, self.slot, FrameJudge(robot), self,
-            Ticker(PERIOD_S, lambda: self.time_s, self.wait), self.stop, lambda line: self.log(line),
+            robot,
+            self,
+            desired,
+            self.slot,
+            FrameJudge(robot),
+            self,
+            Ticker(PERIOD_S, lambda: self.time_s, self.wait),
+            self.stop,
+            lambda line: self.log(line),
             self.tally,
-        )  # fmt: skip
+        )
 
     def frame(self, angles=None, **changes):
         at_s = self.time_s - self.frame_age_s

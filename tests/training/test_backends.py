@@ -62,8 +62,13 @@ def collected(folder: Path, *arguments: str, expect: int = 0) -> subprocess.Comp
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     found = subprocess.run(
         [sys.executable, "script.py", *arguments],
-        cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
     assert found.returncode == expect, found.stderr
     return found
 

@@ -107,9 +107,14 @@ def test_robots_off_the_drawing_stay_whole_under_full_range_jumps(modules, facto
 
 @pytest.mark.parametrize(
     "changed",
-    [{"stiffness": [1.0, 1.0]}, {"stiffness": [1.0, 0.0, 1.0]}, {"stiffness": [1.0, np.nan, 1.0]},
-     {"tip_payload_kg": -0.01}, {"tip_payload_kg": np.nan}],
-)  # fmt: skip
+    [
+        {"stiffness": [1.0, 1.0]},
+        {"stiffness": [1.0, 0.0, 1.0]},
+        {"stiffness": [1.0, np.nan, 1.0]},
+        {"tip_payload_kg": -0.01},
+        {"tip_payload_kg": np.nan},
+    ],
+)
 def test_stiffness_and_payload_of_no_robot_are_refused(changed):
     makers = [Arm] if fleet_kernel.library() is None else [Arm, lambda *given, **more: Fleet(*given, 1, **more)]
     for make in makers:

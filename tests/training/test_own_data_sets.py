@@ -136,10 +136,23 @@ WRONG = {
 WRONG |= {
     f"borders {value}": ({"stage_borders": np.array(value)}, BORDERS)
     for value in (
-        [0, 5], [0, 999], [0], [], K, [K, 0], [1, K], [-3, K], [0, 9, 4, K], [0.0, float(K)], [[0, K]], [0, np.nan],
-        [0, 2**63 + K], [False, True], list(range(200)),
+        [0, 5],
+        [0, 999],
+        [0],
+        [],
+        K,
+        [K, 0],
+        [1, K],
+        [-3, K],
+        [0, 9, 4, K],
+        [0.0, float(K)],
+        [[0, K]],
+        [0, np.nan],
+        [0, 2**63 + K],
+        [False, True],
+        list(range(200)),
     )
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", WRONG)
@@ -153,9 +166,7 @@ def test_anything_else_is_one_line_when_it_is_read(tmp_path, kind):
 
 
 def test_one_step_is_too_few_to_train_on(tmp_path):
-    path = written(
-        tmp_path / "own.h5", CONFIGURATION[:, :2], ACTION[:, :1], stage_borders=np.array([0, 1])
-    )  # fmt: skip
+    path = written(tmp_path / "own.h5", CONFIGURATION[:, :2], ACTION[:, :1], stage_borders=np.array([0, 1]))
     with pytest.raises(ModelError, match="2 samples leave none for"):
         dataset.split(dataset.read(path), 3, "blocks", 0)
 

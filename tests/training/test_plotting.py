@@ -30,9 +30,14 @@ plotting.save(draw, Path("out.png"), 50)
 def drawn(folder, **environment):
     """The picture that a new process makes there."""
     done = subprocess.run(
-        [sys.executable, "-P", "-c", CODE], capture_output=True, text=True, timeout=60, check=False,
-        cwd=folder, env={**os.environ, **environment},
-    )  # fmt: skip
+        [sys.executable, "-P", "-c", CODE],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        cwd=folder,
+        env={**os.environ, **environment},
+    )
     assert done.returncode == 0, done.stderr
     return (folder / "out.png").read_bytes()
 

@@ -25,9 +25,13 @@ def command(folder: Path, *arguments: str) -> list[str]:
 
 def run(folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
     return subprocess.run(
-        command(folder, *arguments), cwd=folder, capture_output=True, text=True, check=False,
+        command(folder, *arguments),
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
         env={**os.environ, **environment},
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture

@@ -40,8 +40,10 @@ def collected(robot: str, samples: int, jobs: int) -> dict[str, Any]:
         start_s = time.perf_counter()
         found = subprocess.run(
             [sys.executable, "-P", "-c", MEASURED, *asked],
-            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True,
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            check=True,
+        )
         seconds = time.perf_counter() - start_s
         size = out.stat().st_size
     return {

@@ -86,8 +86,9 @@ def swinging(modules: int, at_s: float) -> list[Any]:
     tilt = np.cumsum(bend)
     cos, sin = np.cos(tilt), np.sin(tilt)
     zero, one = np.zeros(modules), np.ones(modules)
-    directors = np.stack([np.stack([cos, zero, -sin], -1), np.stack([zero, one, zero], -1),
-                          np.stack([sin, zero, cos], -1)], axis=1)  # fmt: skip
+    directors = np.stack(
+        [np.stack([cos, zero, -sin], -1), np.stack([zero, one, zero], -1), np.stack([sin, zero, cos], -1)], axis=1
+    )
     positions = MODULE_M * np.cumsum(directors[:, 2], axis=0)
     return tool_poses(positions, directors).tolist()
 
@@ -182,12 +183,18 @@ def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict
             judge = FrameJudge(robot)
             desired = np.repeat(from_angles_deg(np.zeros((1, modules))), count, axis=0)
             Loop(
-                robot, Stamped(controller, "actuate", stamps, "features", "answer"), desired, slot,
+                robot,
+                Stamped(controller, "actuate", stamps, "features", "answer"),
+                desired,
+                slot,
                 Stamped(judge, "judge", stamps, "taken", "judged"),
                 Stamped(board, "set_pressures", stamps, "pressures", "handed"),
-                Ticker(robot.loop.period_s, time.monotonic, spinning(wait)), stop, log, Tally(robot, count),
+                Ticker(robot.loop.period_s, time.monotonic, spinning(wait)),
+                stop,
+                log,
+                Tally(robot, count),
                 warm_up=WarmUp(robot, controller.actuate, judge, log) if warm else None,
-            ).run(from_angles_deg(np.zeros(modules)))  # fmt: skip
+            ).run(from_angles_deg(np.zeros(modules)))
             board.close()
             reader.close()
         finally:
@@ -269,9 +276,12 @@ def limited_to_avx2() -> dict[str, str]:
 def table(result: dict[str, Any]) -> str:
     """One run in Markdown."""
     columns, described = (*STAGES, "ours", "all"), result["about"]
-    lines = [f"Instruction set {described['isa']}: {described['processor']}; {described['cores']} cores, onnxruntime "
-             f"{described['onnxruntime']}, numpy {described['numpy']}, commit {described['commit']}, load average "
-             f"{described['load_average']:.1f}. Milliseconds, median (99th percentile).", ""]  # fmt: skip
+    lines = [
+        f"Instruction set {described['isa']}: {described['processor']}; {described['cores']} cores, onnxruntime "
+        f"{described['onnxruntime']}, numpy {described['numpy']}, commit {described['commit']}, load average "
+        f"{described['load_average']:.1f}. Milliseconds, median (99th percentile).",
+        "",
+    ]
     lines += ["| modules | warm-up | ticks | " + " | ".join(columns) + " | all / wire |"]
     lines += ["| ---: | --- " + "| ---: " * (len(columns) + 2) + "|"]
     for row in result["rows"]:
@@ -311,13 +321,21 @@ column is the same code in both tables.
 
 
 @click.command(help=__doc__)
-@click.option("--isa", type=click.Choice(["native", "avx2"]), default="native", show_default=True,
-              help="Instruction set of numpy.")  # fmt: skip
+@click.option(
+    "--isa",
+    type=click.Choice(["native", "avx2"]),
+    default="native",
+    show_default=True,
+    help="Instruction set of numpy.",
+)
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all figures here, one JSON object.")
 @click.option("--report", type=click.Path(path_type=Path), help="Markdown page to update.")
 @click.option("--quick", is_flag=True, help="60 ticks in place of 120 each, with warm-up alone: less than a minute.")
-@click.option("--model", type=click.Path(exists=True, path_type=Path),
-              help="Controller of modsoft-export, for any number of modules.  [default: the shipped one]")  # fmt: skip
+@click.option(
+    "--model",
+    type=click.Path(exists=True, path_type=Path),
+    help="Controller of modsoft-export, for any number of modules.  [default: the shipped one]",
+)
 def main(isa: str, json_file: Path | None, report: Path | None, quick: bool, model: Path | None) -> None:
     if isa == "avx2" and (limits := limited_to_avx2())["NPY_DISABLE_CPU_FEATURES"]:
         # numpy reads the limit when it is imported

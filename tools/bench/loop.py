@@ -144,10 +144,15 @@ def ratios(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def table(result: dict[str, Any]) -> str:
-    lines = [f"{result['system']}, {result['cores']} cores, load average {result['load_average']:.1f} before; "
-             f"{result['seconds']:g} s each, all at once on core {result['core']}", ""]  # fmt: skip
-    lines += ["| busy beside | Hz | pace | ticks | p50 ms | p99 ms | p99.9 ms | max ms | skipped | shortest gap "
-              "/ period | gaps below half |"]  # fmt: skip
+    lines = [
+        f"{result['system']}, {result['cores']} cores, load average {result['load_average']:.1f} before; "
+        f"{result['seconds']:g} s each, all at once on core {result['core']}",
+        "",
+    ]
+    lines += [
+        "| busy beside | Hz | pace | ticks | p50 ms | p99 ms | p99.9 ms | max ms | skipped | shortest gap "
+        "/ period | gaps below half |"
+    ]
     lines += ["| ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"]
     for row in result["rows"]:
         lines.append(

@@ -32,9 +32,7 @@ def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]
     pilots = []
     for task, each in flown:
         desired = tasks.task(task, kind, robot.modules)[:steps]
-        pilots.append(
-            Pilot(controller.actuate, controller.history, desired, correction.named(each, robot.modules))
-        )
+        pilots.append(Pilot(controller.actuate, controller.history, desired, correction.named(each, robot.modules)))
     errors = angle_errors_deg if kind == "pneumatic" else configuration_errors_percent
     rows: list[dict[str, object]] = []
     for (task, each), pilot, flight in zip(
@@ -42,8 +40,16 @@ def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]
     ):
         mean = errors(flight.configuration, pilot.desired).mean(axis=0)
         unit = "degrees" if kind == "pneumatic" else "percent"
-        rows.append({"model": model, "robot": name, "task": task, "correction": each, "unit": unit,
-                     "error": [round(float(value), 3) for value in mean]})  # fmt: skip
+        rows.append(
+            {
+                "model": model,
+                "robot": name,
+                "task": task,
+                "correction": each,
+                "unit": unit,
+                "error": [round(float(value), 3) for value in mean],
+            }
+        )
     return rows
 
 

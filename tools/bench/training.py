@@ -193,8 +193,16 @@ def step_times(rounds: int) -> list[dict[str, Any]]:
             times.append((middle_s - began_s, time.process_time() - middle_s))
         gradient_ms, optimizer_ms = (1e3 * float(each) for each in np.median(times[1:], axis=0))
         share = optimizer_ms / (gradient_ms + optimizer_ms)
-        rows.append({"batch": batch, "modules": robot.modules, "gradient_ms": gradient_ms,
-                     "optimizer_ms": optimizer_ms, "share": share, "wanted_share": wanted})  # fmt: skip
+        rows.append(
+            {
+                "batch": batch,
+                "modules": robot.modules,
+                "gradient_ms": gradient_ms,
+                "optimizer_ms": optimizer_ms,
+                "share": share,
+                "wanted_share": wanted,
+            }
+        )
     return rows
 
 
@@ -389,9 +397,15 @@ Processor seconds to the error of the paper's Table 1, the mean over the four mo
 @click.option("--seed", default=0, show_default=True)
 @click.option("--run", nargs=2, hidden=True)
 def main(
-    isa: str, json_file: Path | None, report: Path | None, quick: bool, data: Path | None, minutes: float, run: Any,
+    isa: str,
+    json_file: Path | None,
+    report: Path | None,
+    quick: bool,
+    data: Path | None,
+    minutes: float,
+    run: Any,
     **options: Any,
-) -> None:  # fmt: skip
+) -> None:
     if run and run[0] == "steps":
         click.echo(json.dumps(step_times(int(run[1]))))
         return

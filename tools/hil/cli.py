@@ -28,11 +28,19 @@ AFTER_S = 1.5  # the trace goes on for so long, until the chambers are empty
 @click.option("--robot", "robot_file", required=True, help="Robot file, or a shipped robot's name (pneumatic-3, ...).")
 @click.option("--model", required=True, type=click.Path(path_type=Path), help="Controller of modsoft-export.")
 @click.option("--task", required=True, help="Task's name (edge, down), or a .npy file of desired configurations.")
-@click.option("--report", required=True, type=click.Path(path_type=Path, file_okay=False),
-              help="Folder to write, new or empty; one that holds a report already is refused.")  # fmt: skip
-@click.option("--board", default="auto", type=click.Choice(["auto", "simavr", "native"]),
-              help="simavr: the compiled firmware on an emulated ATmega2560. native: its logic compiled for this "
-                   "machine. auto: simavr where it can be had.")  # fmt: skip
+@click.option(
+    "--report",
+    required=True,
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder to write, new or empty; one that holds a report already is refused.",
+)
+@click.option(
+    "--board",
+    default="auto",
+    type=click.Choice(["auto", "simavr", "native"]),
+    help="simavr: the compiled firmware on an emulated ATmega2560. native: its logic compiled for this "
+    "machine. auto: simavr where it can be had.",
+)
 @click.option("--steps", type=click.IntRange(1), help="Run only so many control steps.  [default: the whole task]")
 def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps: int | None) -> int:
     """Run a controller in real time on hardware that is not there, and judge the run.

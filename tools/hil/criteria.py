@@ -144,12 +144,18 @@ def acceptances(record: Record) -> list[Acceptance]:
             True,
         ),
         at_most("set-points never acknowledged", unacknowledged, 0, timing=True),
-        at_most("set-point to acknowledgement, 99th percentile", p99(acknowledged), ACKNOWLEDGED_P99_MS,
-                " ms", timing=True),
-        at_most("valve outputs off the log, worst of every tick and channel", _worst(differences), VALVE_COUNTS,
-                " counts"),
-        at_most("valve outputs outside old and new set-point, worst of all times and channels",
-                _worst(valve_excursion(record)), VALVE_COUNTS, " counts"),
+        at_most(
+            "set-point to acknowledgement, 99th percentile", p99(acknowledged), ACKNOWLEDGED_P99_MS, " ms", timing=True
+        ),
+        at_most(
+            "valve outputs off the log, worst of every tick and channel", _worst(differences), VALVE_COUNTS, " counts"
+        ),
+        at_most(
+            "valve outputs outside old and new set-point, worst of all times and channels",
+            _worst(valve_excursion(record)),
+            VALVE_COUNTS,
+            " counts",
+        ),
         at_most("largest valve output ever", highest, allowed + VALVE_COUNTS, " counts"),
         at_most("largest duty before the first set-point", largest_duty_before(record), 0.0),
         at_most("ticks without time for the valves to settle", int(np.isnan(differences).sum()), 0),
@@ -158,14 +164,17 @@ def acceptances(record: Record) -> list[Acceptance]:
         at_most("resets in the run", sum(event["event"] == "reset" for event in running), 0),
         at_most("watchdog resets", watchdogs, 0),
         at_most("bytes dropped by the board's receiver", record.board_dropped_bytes, DROPPED_BYTES),
-        Acceptance(
-            "the board's word that it vented", "yes" if record.said_vented else "no", "yes", record.said_vented
+        Acceptance("the board's word that it vented", "yes" if record.said_vented else "no", "yes", record.said_vented),
+        at_most(
+            "valve outputs at 0 for good, after the vent began", vented_after_ms(record), vent_limit_ms(record), " ms"
         ),
-        at_most("valve outputs at 0 for good, after the vent began", vented_after_ms(record), vent_limit_ms(record),
-                " ms"),
-        at_most("highest chamber pressure at the end", float(np.max(record.plant_bar[-1]))
-                if len(record.plant_bar) else math.nan, CHAMBERS_AT_END_BAR, " bar"),
-    ]  # fmt: skip
+        at_most(
+            "highest chamber pressure at the end",
+            float(np.max(record.plant_bar[-1])) if len(record.plant_bar) else math.nan,
+            CHAMBERS_AT_END_BAR,
+            " bar",
+        ),
+    ]
     if count and len(record.plant_mono_ns) > 1:
         off = measured_off_deg(record)
         lines.append(at_most("configuration used, off the plant's own", _worst(off), MEASURED_OFF_DEG, "°"))

@@ -179,10 +179,20 @@ def write_tool_files(folder: Path, tools: int) -> list[Path]:
 
 @click.command("modsoft-hil-polaris")
 @click.option("--link", required=True, type=click.Path(path_type=Path), help="Name that the serial port gets.")
-@click.option("--firmware", default="Polaris Spectra Rev 009", show_default=True,
-              help='Its version; one that ends in "Rev 007" makes the client ask for TX in place of BX.')  # fmt: skip
-@click.option("--type", "kind", default="polaris", show_default=True, type=click.Choice(list(FRAME_HZ)),
-              help="As in the robot file.")  # fmt: skip
+@click.option(
+    "--firmware",
+    default="Polaris Spectra Rev 009",
+    show_default=True,
+    help='Its version; one that ends in "Rev 007" makes the client ask for TX in place of BX.',
+)
+@click.option(
+    "--type",
+    "kind",
+    default="polaris",
+    show_default=True,
+    type=click.Choice(list(FRAME_HZ)),
+    help="As in the robot file.",
+)
 @click.option("--wired", default=0, help="Tools that are wired to it: aurora.")
 def cli(link: Path, firmware: str, kind: str, wired: int) -> None:
     """A fake optical tracker (started by modsoft-hil)."""

@@ -161,8 +161,11 @@ def _slew_bar_per_s(robot: Robot, meta: Line) -> float:
 def _board_lateness(events: list[Line], summary: Line, start_ns: float, end_ns: int) -> Line:
     """Lateness of the emulated board in the run, NaN where it gave no summary. It says `late` whenever the bound is
     passed and emulated time gives way; without that it was within the bound, or within its largest lateness ever."""
-    late = [event["late_us"] * 1e-3 for event in events if event["event"] == "late"
-            and start_ns <= event["mono_ns"] <= end_ns]  # fmt: skip
+    late = [
+        event["late_us"] * 1e-3
+        for event in events
+        if event["event"] == "late" and start_ns <= event["mono_ns"] <= end_ns
+    ]
     ever_ms = summary.get("max_late_us", math.nan) * 1e-3
     run_ms = (end_ns - start_ns) * 1e-6
     return {

@@ -163,9 +163,7 @@ class Rig:
     def tracker_port(self) -> str:
         return str(self.tracker.ready["port"])
 
-    def run(
-        self, model: str | Path, task: str, *options: str, runs: Path | None = None
-    ) -> subprocess.Popen[bytes]:
+    def run(self, model: str | Path, task: str, *options: str, runs: Path | None = None) -> subprocess.Popen[bytes]:
         """Starts modsoft-runtime, unmodified, as anybody would: its console script, beside this interpreter.
 
         Its log goes to a folder in `runs` (None: a new folder in the rig's own), what it says to runtime.out and
@@ -177,10 +175,25 @@ class Rig:
         self.runs = runs or Path(tempfile.mkdtemp(prefix=LOG_PREFIX, dir=self.folder))
         tools = [option for path in self.tool_files for option in ("--tool", str(path))]
         command = [
-            str(script), "--yes", "--robot", self._robot_file, "--model", str(model), "--task", task,
-            "--port", self.board.port, "--tracker", "ndi", "--tracker-port", self.tracker_port, *tools,
-            "--runs-dir", str(self.runs), *options,
-        ]  # fmt: skip
+            str(script),
+            "--yes",
+            "--robot",
+            self._robot_file,
+            "--model",
+            str(model),
+            "--task",
+            task,
+            "--port",
+            self.board.port,
+            "--tracker",
+            "ndi",
+            "--tracker-port",
+            self.tracker_port,
+            *tools,
+            "--runs-dir",
+            str(self.runs),
+            *options,
+        ]
         with (self.folder / "runtime.out").open("wb") as out, (self.folder / "runtime.err").open("wb") as errors:
             self.runtime = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=errors, start_new_session=True

@@ -48,9 +48,7 @@ class Soak:
     below `folder`; `every_s` between two faults on average. A new runtime is started whenever a fault ended the one
     before."""
 
-    def __init__(
-        self, rig: SoakRig, model: Path, task: str, folder: Path, minutes: float, seed: int, every_s: float
-    ):
+    def __init__(self, rig: SoakRig, model: Path, task: str, folder: Path, minutes: float, seed: int, every_s: float):
         self.rig, self.model, self.folder = rig, model, folder
         self._pause_s = (0.5 * every_s, 1.5 * every_s)
         self.runs: list[Ran] = []
@@ -166,9 +164,7 @@ class Soak:
 
     # ---- What came of it
 
-    def _judge(
-        self, ran: Ran, injected: list[Injected], by_itself: bool, board_began: int, plant_began: int
-    ) -> None:
+    def _judge(self, ran: Ran, injected: list[Injected], by_itself: bool, board_began: int, plant_began: int) -> None:
         """Makes the run's folder whole, and checks it."""
         rig, run = self.rig, self.rig.run_folder()
         assert rig.runs is not None

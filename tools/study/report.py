@@ -91,7 +91,7 @@ def lines(found: dict[str, Any], notes: str) -> list[str]:
     text += [f"Made by `modsoft-evaluate study`, version {about['code_version']}, seeds {seeds}."]
     if about["steps"] is not None:
         text += [f"**Short form: {about['steps']} steps of each task, little data, short training. It says nothing.**"]
-    text += [f"{met} of {met + len(missed)} marks are met; those that are not stand under \"Missed\".", ""]
+    text += [f'{met} of {met + len(missed)} marks are met; those that are not stand under "Missed".', ""]
     text += [HOW_TO_READ, ""]
     for title, each in told.items():
         text += [f"## {title}", "", *each.lines]

@@ -33,8 +33,16 @@ from modsoft.training.simulation.rollout import Flight, Pilot, fly
 TOGETHER = 16  # robots of a batch: two blocks of the kernel's widest vectors
 # The code that shapes a run beside the model and the kernel.
 SHAPES: tuple[ModuleType, ...] = (
-    actuation, features, model, corrections, tasks, rollout, fleet, parameters, perturbations,
-)  # fmt: skip
+    actuation,
+    features,
+    model,
+    corrections,
+    tasks,
+    rollout,
+    fleet,
+    parameters,
+    perturbations,
+)
 STEP_S = 4e-3  # of one core, for a control step of one robot of four modules, about
 
 Array = NDArray[np.float64]

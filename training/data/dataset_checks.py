@@ -44,8 +44,9 @@ def attributes(found: Any, where: Path) -> dict[str, Any]:
     """All of `ATTRIBUTES` out of those of a file."""
     missing = [name for name in ATTRIBUTES if name not in found]
     if missing:
-        raise ModelError(f"{where}: not a data set of modsoft-collect: no attribute {missing[0]}, expected "
-                         f"{ATTRIBUTES[missing[0]]}")  # fmt: skip
+        raise ModelError(
+            f"{where}: not a data set of modsoft-collect: no attribute {missing[0]}, expected {ATTRIBUTES[missing[0]]}"
+        )
     return {name: found[name] for name in ATTRIBUTES}
 
 
@@ -139,8 +140,10 @@ def action(found: Array, where: Path) -> None:
 def _finite(name: str, found: Array, where: Path) -> None:
     if not np.isfinite(found).all():
         episode, step, module, _ = map(int, np.argwhere(~np.isfinite(found))[0])
-        raise ModelError(f"{where}: {name} holds values that are not finite, first in episode {episode}, step {step}, "
-                         f"module {module + 1}")  # fmt: skip
+        raise ModelError(
+            f"{where}: {name} holds values that are not finite, first in episode {episode}, step {step}, "
+            f"module {module + 1}"
+        )
 
 
 def _short(value: Any) -> str:

@@ -61,9 +61,7 @@ def named(name: str, robot: Robot) -> Plant:
     return Plant(name, functools.partial(by_fleet, variant=name.removeprefix("fleet-")), together=8)
 
 
-def by_fleet(
-    robot: Robot, actions: Array, variant: str | None = None, *, variation: Variation | None = None
-) -> Array:
+def by_fleet(robot: Robot, actions: Array, variant: str | None = None, *, variation: Variation | None = None) -> Array:
     """Robots side by side in compiled code."""
     fleet = Fleet(robot.robot.kind, robot.modules, len(actions), variant=variant, **_differences(variation))
     return _run(fleet, actions, robot.loop.period_s)

@@ -63,11 +63,16 @@ _COMPILE = ("gcc", "-O2", "-g", "-std=gnu11", "-Wall", "-Wextra", f"-I{SOURCES}"
 _LINK = {
     # avr-libc's headers come last: of them only the register names are wanted.
     "simavr": (
-        "-isystem/usr/include/simavr", "-idirafter/usr/lib/avr/include",
-        "-l:libsimavr.a", "-l:libelf.so.1", "-lutil", "-lpthread", "-lm",
+        "-isystem/usr/include/simavr",
+        "-idirafter/usr/lib/avr/include",
+        "-l:libsimavr.a",
+        "-l:libelf.so.1",
+        "-lutil",
+        "-lpthread",
+        "-lm",
     ),
     "native": ("-lm",),
-}  # fmt: skip
+}
 START_TIMEOUT_S = 10.0
 RUN_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 3.0
