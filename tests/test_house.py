@@ -36,6 +36,7 @@ def test_imports_go_one_way(part):
 
 def test_style():
     subprocess.run([sys.executable, "-m", "ruff", "check", "."], cwd=ROOT, check=True)
+    subprocess.run([sys.executable, "-m", "ruff", "format", "--check", "."], cwd=ROOT, check=True)
 
 
 def test_firmware_header_is_generated_from_the_protocol():

@@ -15,6 +15,19 @@ class BiLSTM(nn.Module):
     """Features of all modules to their actuation. One set of weights serves any number of modules, since the sequence
     is the row of modules: forward from base to tip, backward from tip to base (Figure 1).
 
+    Eq. (2), for module n with the features x_n (in layers above the first: both directions' h_n of the layer below),
+    and h, c of the neighbour before it in the direction of the pass (zero at the end of the robot):
+
+        i = sigmoid(W_i x_n + U_i h + b_i)        input gate
+        f = sigmoid(W_f x_n + U_f h + b_f)        forget gate
+        g = tanh(W_g x_n + U_g h + b_g)           candidate of the cell
+        o = sigmoid(W_o x_n + U_o h + b_o)        output gate
+        c_n = f * c + i * g
+        h_n = o * tanh(c_n)
+
+    torch stacks the gates in the order i, f, g, o in the rows of `weight_ih` (W), `weight_hh` (U) and of the two
+    biases, whose sum is b. The actuation is a linear map of both directions' h_n in the last layer.
+
     Table S1: 4 layers of hidden size 128 in each direction; dropout between layers acts in training only.
     """
 
