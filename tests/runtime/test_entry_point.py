@@ -41,7 +41,8 @@ def run(what: str, **streams) -> subprocess.CompletedProcess:
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_a_signal_ends_it_in_order(name, code):
-    done = run(name)
+    # A suite that a script starts in the background ignores Ctrl-C, and so would its children.
+    done = run(name, preexec_fn=lambda: signal.signal(getattr(signal, name), signal.SIG_DFL))
     assert (done.returncode, done.stdout) == (code, "cleared up\n")
     assert done.stderr.strip() == "modsoft-train: interrupted; the same command goes on"
 
