@@ -1,0 +1,27 @@
+"""Control a simulated three-module robot with an exported model: python examples/control_simulated_robot.py [MODEL]"""
+
+import sys
+from pathlib import Path
+
+from modsoft.runtime import robot as robots
+from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.tasks import task
+from modsoft.training.simulation.fleet import simulated
+from modsoft.training.simulation.rollout import Pilot, angle_errors_deg, fly
+
+SHIPPED = Path(__file__).resolve().parents[1] / "tools" / "models" / "pneumatic-3.onnx"
+
+
+def main() -> None:
+    robot = robots.load("pneumatic-3")
+    model = Controller.load(Path(sys.argv[1]) if len(sys.argv) > 1 else SHIPPED)
+    model.check(robot)  # trained for a robot of this kind?
+    desired = task("down", "pneumatic", robot.modules)  # (K, N, 3), one configuration a control step
+    arm = simulated("pneumatic", robot.modules, 1)
+    [run] = fly(robot, arm, [Pilot(model.actuate, model.history, desired)])
+    for module, error in enumerate(angle_errors_deg(run.configuration, desired).mean(axis=0), start=1):
+        print(f"module {module}: mean error of the bending angle {error:.2f} degrees")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""Plot the bending angles of a run: python examples/plot_run_log.py RUN_FOLDER [PICTURE]"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from modsoft.runtime import log
+from modsoft.runtime.control.features import bending_angle_deg
+from modsoft.training import plotting
+
+
+def main() -> None:
+    run = log.read(Path(sys.argv[1]))
+    picture = Path(sys.argv[2]) if len(sys.argv) > 2 else Path("angles.png")
+    ticks = [tick for tick in run.ticks if tick["configuration"] is not None]  # None: no valid frame in that step
+    step = [tick["tick"] for tick in ticks]
+    measured, desired = (
+        bending_angle_deg(np.array([tick[key] for tick in ticks])) for key in ("configuration", "desired")
+    )
+
+    def draw():
+        figure = plotting.figure(7.0, 4.0)
+        axes = figure.subplots()
+        for module in range(measured.shape[1]):
+            axes.plot(step, desired[:, module], "--", color=f"C{module}")
+            axes.plot(step, measured[:, module], color=f"C{module}", label=f"module {module + 1}")
+        axes.set(xlabel="control step", ylabel="bending angle, degrees (dashed: desired)")
+        axes.legend()
+        return figure
+
+    plotting.save(draw, picture, dpi=150)
+    print(picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""The examples run as they are, and stay short enough to read at once."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from modsoft.runtime.control.features import from_angles_deg
+from modsoft.runtime.log import RunLog
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def run(name, *arguments, folder):
+    return subprocess.run(
+        [sys.executable, "-P", EXAMPLES / name, *arguments], cwd=folder, capture_output=True, text=True, check=True
+    ).stdout
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_an_example_has_at_most_forty_lines(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 40
+
+
+def test_a_simulated_robot_follows_its_task(tmp_path):
+    lines = run("control_simulated_robot.py", folder=tmp_path).splitlines()
+    assert [line.split(":")[0] for line in lines] == ["module 1", "module 2", "module 3"]
+    assert max(float(line.split()[-2]) for line in lines) < 2.0
+
+
+@pytest.mark.realtime
+def test_the_board_arms_and_vents(tmp_path):
+    output = run("talk_to_the_board.py", folder=tmp_path)
+    assert "0.1 " in output.split("commanded, bar:")[1]
+    assert "vented: True" in output
+
+
+def test_a_run_log_becomes_a_picture(tmp_path):
+    log = RunLog(tmp_path / "runs", "arm", "", {})
+    for step in range(5):
+        configuration = from_angles_deg(np.array([0.0, 5.0, 9.0]) * step)
+        lost = None if step == 2 else configuration
+        log.put(
+            {
+                "tick": step,
+                "configuration": lost,
+                "desired": configuration,
+                "acknowledged": {"tick": step - 1, "ms": 1.0},
+            }
+        )
+    log.close(0, "done", {})
+    assert run("plot_run_log.py", str(log.folder), folder=tmp_path) == "angles.png\n"
+    assert (tmp_path / "angles.png").read_bytes().startswith(b"\x89PNG")
