@@ -8,13 +8,14 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
+from typing import Any
 
 import click
 
 from modsoft.runtime import process
-from modsoft.runtime.errors import INTERNAL_EXIT_CODE, DeviceAbsent, ModsoftError, OutputError
+from modsoft.runtime.errors import INTERNAL_EXIT_CODE, DeviceAbsent, ModsoftError, OutputError, UsageError
 
 BROKEN_PIPE_EXIT_CODE = 141  # a shell's for SIGPIPE, as of every program before `| head`
 OF_STREAMS = (errno.ENOSPC, errno.EIO, errno.EBADF)  # a full or closed standard output; files are told elsewhere
@@ -53,6 +54,29 @@ def entry(command: click.Command, goes_on: bool = False) -> Callable[[], None]:
         sys.exit(_flushed(command, code))
 
     return main
+
+
+def renamed_option(old: str, new: str) -> Callable[[Any], Any]:
+    """A decorator of a command: the option `old` of earlier versions is refused in one line that names `new`."""
+
+    def refuse(context: click.Context, option: click.Parameter, value: str | None) -> None:
+        if value is not None:
+            raise UsageError(f"{old} is now {new}; give {new}")
+
+    return click.option(old, hidden=True, expose_value=False, callback=refuse)
+
+
+class Choice(click.Choice):  # type: ignore[type-arg]  # not generic before click 8.2
+    """`click.Choice` that refuses the choices of earlier versions in one line that names the new one."""
+
+    def __init__(self, choices: Sequence[str], renamed: dict[str, str]):
+        super().__init__(choices)
+        self._renamed = renamed
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        if value in self._renamed:
+            raise UsageError(f"{value} is now {self._renamed[value]}; give {self._renamed[value]}")
+        return super().convert(value, param, ctx)
 
 
 def _run(command: click.Command, interrupted: str) -> int:

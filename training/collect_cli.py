@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.entry_point import entry
+from modsoft.runtime.entry_point import entry, renamed_option
 from modsoft.runtime.files import check_not_input, check_writable
 
 
@@ -47,7 +47,8 @@ from modsoft.runtime.files import check_not_input, check_writable
     "and its parameters (cores=1, memory=2GB, ...); what its ports get is run, so keep them off open networks, or give "
     "dask's TLS (security=true). May be repeated.",
 )
-@click.option("--plant", help="Simulator: elastica, fleet-plain, fleet-avx2, ...  [default: the fastest here]")
+@click.option("--simulator", help="elastica, fleet-plain, fleet-avx2, ...  [default: the fastest here]")
+@renamed_option("--plant", "--simulator")
 @click.pass_context
 def cli(
     context: click.Context,
@@ -60,7 +61,7 @@ def cli(
     jobs: int | None,
     backend: str,
     options: tuple[str, ...],
-    plant: str | None,
+    simulator: str | None,
 ) -> None:
     """Drive the simulated robot with random actions and record what it does.
 
@@ -85,9 +86,9 @@ def cli(
     from modsoft.training.data.collect import collect
     from modsoft.training.simulation import simulators
 
-    chosen = simulators.fastest(robot) if plant is None else simulators.named(plant, robot)
-    if plant is None and chosen.name == "elastica":
-        click.echo("the fast plant is not built (no C compiler at installation?): PyElastica, slower", err=True)
+    chosen = simulators.fastest(robot) if simulator is None else simulators.named(simulator, robot)
+    if simulator is None and chosen.name == "elastica":
+        click.echo("the fast simulator is not built (no C compiler at installation?): PyElastica, slower", err=True)
     bar: tqdm | None = None
 
     def progress(done: int, total: int) -> None:

@@ -33,8 +33,8 @@ from modsoft.training.data.dataset import DataSet, Windows, split
 # hardly moves beside them, so that they are as good as a robot of their own; with the cable robot nothing was gained by
 # training on them.
 BY_KIND: dict[str, dict[str, Any]] = {
-    "cable": {"history": 5, "batch": 64, "shorter": 0.0},
-    "pneumatic": {"history": 10, "batch": 128, "shorter": 0.4},
+    "cable": {"history": 5, "batch": 64, "truncation_probability": 0.0},
+    "pneumatic": {"history": 10, "batch": 128, "truncation_probability": 0.4},
 }
 CUDA_BATCHES = 4  # times these windows in a step on a GPU, which small batches leave idle
 ACTUATION_RANGE = 2.0  # errors are told in percent of it
@@ -53,11 +53,11 @@ class Settings:
     history: int  # T
     network: str = "bilstm"  # one of networks.NETWORKS
     batch: int = 64
-    shorter: float = 0.0  # share of the steps that take the robot's last modules for a robot of their own
+    truncation_probability: float = 0.0  # of a step that takes the robot's last modules for a robot of their own
     iterations: int = 6000
     minutes: float | None = None  # of wall clock; the learning rate ends its cycle with whichever ends first
     target_percent: float | None = None  # validation error, mean of the modules, that ends the run as soon as reached
-    rate: float = 3e-3  # peak of the one-cycle learning rate; 0.001 and 0.0003, constant, in Table S1
+    learning_rate: float = 3e-3  # peak of the one-cycle learning rate; 0.001 and 0.0003, constant, in Table S1
     dropout: float = 0.0  # between layers; 0.05 makes estimation worse, with 16,000 samples of cable-4 as with 96,000
     layers: int = 4  # Table S1
     hidden: int = 128  # Table S1
@@ -68,8 +68,11 @@ class Settings:
     device: str = "cpu"  # one of DEVICES
 
     def __post_init__(self) -> None:
-        if self.network != "bilstm" and self.shorter:
-            raise UsageError(f"--shorter {self.shorter}: the network {self.network} is bound to its number of modules")
+        if self.network != "bilstm" and self.truncation_probability:
+            raise UsageError(
+                f"--truncation-probability {self.truncation_probability}: the network {self.network} is bound to its "
+                "number of modules"
+            )
         if self.precision not in PRECISIONS:
             raise UsageError(f"precision {self.precision!r}, expected one of {', '.join(PRECISIONS)}")
         if self.device not in DEVICES:
@@ -87,7 +90,7 @@ def settings_for(kind: str, options: dict[str, Any]) -> Settings:
         given["device"] = "cuda" if torch.cuda.is_available() else "cpu"
     suited = dict(BY_KIND[kind])
     if given.get("network", "bilstm") != "bilstm":
-        suited["shorter"] = 0.0
+        suited["truncation_probability"] = 0.0
     if given["device"] == "cuda":
         suited["batch"] *= CUDA_BATCHES
     settings = Settings(**{**suited, **given})
@@ -215,7 +218,7 @@ def _train(
         resume.unlink(missing_ok=True)  # there is nothing in it to go on from
         raise ModelError(
             f"{out}: training diverged, validation error {state['best_percent']:.3g} % of the actuation range at best; "
-            "try a smaller --rate"
+            "try a smaller --learning-rate"
         )
 
     network.load_state_dict(state["best"])
@@ -327,7 +330,7 @@ def _fit(
         loss.backward()
         # The first steps at a high rate now and then meet a gradient a hundred times the usual one.
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step(one_cycle(share, settings.rate))
+        optimiser.step(one_cycle(share, settings.learning_rate))
 
         iteration += 1
         before, share = share, _share(iteration, clock() - began_s, settings)
@@ -363,9 +366,9 @@ def _reached(percent: float, settings: Settings) -> bool:
 
 
 def _modules_of_step(modules: int, settings: Settings, iteration: int) -> int:
-    """Modules that the robot of this step has: all, or in the share `shorter` of the steps from 2 to all but one."""
+    """Modules that the robot of this step has: all, or, with `truncation_probability`, from 2 to all but one."""
     rng = np.random.default_rng([settings.seed, 1, iteration])
-    return int(rng.integers(2, modules)) if modules > 2 and rng.uniform() < settings.shorter else modules
+    return int(rng.integers(2, modules)) if modules > 2 and rng.uniform() < settings.truncation_probability else modules
 
 
 def _share(iteration: int, elapsed_s: float, settings: Settings) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from modsoft.runtime.entry_point import entry
+from modsoft.runtime.entry_point import entry, renamed_option
 from modsoft.runtime.errors import UsageError
 from modsoft.runtime.files import check_not_input, check_writable, target_of
 
@@ -37,12 +37,12 @@ from modsoft.runtime.files import check_not_input, check_writable, target_of
     type=click.IntRange(1),
     help="Windows in a step.  [default: 64 cable, 128 pneumatic; 4 times as many on a GPU]",
 )
-@click.option("--rate", default=3e-3, type=click.FloatRange(0, 1e6, min_open=True), help="Peak learning rate.")
+@click.option("--learning-rate", default=3e-3, type=click.FloatRange(0, 1e6, min_open=True), help="Peak learning rate.")
 @click.option("--dropout", default=0.0, type=click.FloatRange(0, 1, max_open=True), help="Between the layers.")
 @click.option(
-    "--shorter",
+    "--truncation-probability",
     type=click.FloatRange(0, 1),
-    help="Share of the steps that take the last modules for a shorter robot; bilstm only.  "
+    help="Of a step that takes the last modules for a robot of their own; bilstm only.  "
     "[default: 0 cable, 0.4 pneumatic]",
 )
 @click.option("--history", type=click.IntRange(1), help="Time steps T.  [default: 5 cable, 10 pneumatic]")
@@ -66,6 +66,8 @@ from modsoft.runtime.files import check_not_input, check_writable, target_of
     help="auto: a GPU where torch finds one, else the CPU.",
 )
 @click.option("--threads", default=1, type=click.IntRange(1), help="Cores; more than are free is far slower than one.")
+@renamed_option("--rate", "--learning-rate")
+@renamed_option("--shorter", "--truncation-probability")
 def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
     """Train a network of the paper's Table S1, by default the bidirectional LSTM, on one or more data sets of
     modsoft-collect, all of the same robot.
@@ -81,7 +83,7 @@ def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
     """
     for name, value in options.items():
         if isinstance(value, float) and not math.isfinite(value):
-            raise UsageError(f"--{name} {value}: expected a finite number")
+            raise UsageError(f"--{name.replace('_', '-')} {value}: expected a finite number")
     check_writable(out)
     check_not_input(out, *data_files)
     check_not_input((target := target_of(out)).with_name(f"{target.name}.resume"), *data_files)

@@ -5,7 +5,10 @@ import signal
 import subprocess
 import sys
 
+import click
 import pytest
+
+from modsoft.runtime.entry_point import Choice, entry, renamed_option
 
 SCRIPT = """
 import os, signal, sys, click
@@ -86,3 +89,22 @@ def test_streams_that_were_closed_before():
     for number in range(3):
         done = run("read", preexec_fn=lambda number=number: os.close(number))
         assert done.returncode == 0, done.stderr
+
+
+def test_options_and_choices_of_earlier_versions_are_refused_with_the_new_name(capsys, monkeypatch):
+    @click.command("modsoft-train")
+    @click.option("--kind", type=Choice(["new"], {"old": "new"}))
+    @renamed_option("--before", "--now")
+    def cli(kind):
+        click.echo(kind)
+
+    def ended(*arguments):
+        monkeypatch.setattr(sys, "argv", ["modsoft-train", *arguments])
+        with pytest.raises(SystemExit) as left:
+            entry(cli)()
+        return left.value.code, *capsys.readouterr()
+
+    assert ended("--kind", "new") == (0, "new\n", "")
+    assert ended("--kind", "old") == (2, "", "modsoft-train: old is now new; give new\n")
+    assert ended("--before", "1") == (2, "", "modsoft-train: --before is now --now; give --now\n")
+    assert ended("--kind", "other")[0] == 2

@@ -99,7 +99,7 @@ def test_a_plant_is_had_by_its_name():
     assert simulators.names()[-1] == "elastica"
     assert simulators.fastest(robot).name == simulators.names()[0]
     assert simulators.named("elastica", robot).simulate is simulators.by_elastica
-    with pytest.raises(UsageError, match=r"the plant fleet-other does not run here; expected .*elastica"):
+    with pytest.raises(UsageError, match=r"the simulator fleet-other does not run here; expected .*elastica"):
         simulators.named("fleet-other", robot)
 
 
@@ -175,7 +175,7 @@ def test_help_comes_without_the_simulator(tmp_path):
         ([], "missing option --out"),
         (["--out", "d.h5", "--backend-option", "fast"], "--backend-option fast: expected NAME=VALUE"),
         (["--out", "d.h5", "--backend-option", "fast=1"], "backend local takes no option, found fast"),
-        (["--out", "d.h5", "--plant", "other"], "the plant other does not run here"),
+        (["--out", "d.h5", "--simulator", "other"], "the simulator other does not run here"),
     ],
 )
 def test_what_is_missing_or_wrong_is_told(tmp_path, arguments, message):

@@ -42,7 +42,7 @@ def test_it_learns_and_the_checkpoint_says_all(tmp_path):
     out = tmp_path / "model.pt"
     data = make(20)
     told = []
-    train.train([data], out, dataclasses.replace(SMALL, iterations=600, rate=0.01, dropout=0.0), told.append)
+    train.train([data], out, dataclasses.replace(SMALL, iterations=600, learning_rate=0.01, dropout=0.0), told.append)
     assert list(tmp_path.iterdir()) == [out]
     found = checkpoints.load(out)
     assert robots.from_dict(found["robot"]) == data.robot
@@ -79,7 +79,7 @@ def test_a_precision_that_there_is_not_is_refused():
 
 @pytest.mark.skipif(not train.bfloat16_works("cpu"), reason="the processor has no units for bfloat16")
 def test_it_learns_as_well_with_products_of_bfloat16(tmp_path):
-    settings = dataclasses.replace(SMALL, iterations=600, rate=0.01)
+    settings = dataclasses.replace(SMALL, iterations=600, learning_rate=0.01)
     errors = {}
     for precision in train.PRECISIONS:
         asked = dataclasses.replace(settings, precision=precision)
@@ -103,19 +103,19 @@ def test_a_precision_or_device_that_the_machine_does_not_have_is_refused(monkeyp
 
 def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert train.settings_for("cable", {"device": "auto", "rate": None}) == train.Settings(5, batch=64)
+    assert train.settings_for("cable", {"device": "auto", "learning_rate": None}) == train.Settings(5, batch=64)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     found = train.settings_for("pneumatic", {"device": "auto"})
-    assert (found.device, found.batch, found.shorter) == ("cuda", 512, 0.4)
+    assert (found.device, found.batch, found.truncation_probability) == ("cuda", 512, 0.4)
     found = train.settings_for("pneumatic", {"device": "cpu", "network": "lstm", "history": 7})
-    assert (found.device, found.batch, found.shorter, found.history) == ("cpu", 128, 0.0, 7)
+    assert (found.device, found.batch, found.truncation_probability, found.history) == ("cpu", 128, 0.0, 7)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_a_gpu_gives_the_same_model_within_rounding(tmp_path):
     found = {}
     for device in train.DEVICES:
-        settings = dataclasses.replace(SMALL, device=device, iterations=100, rate=0.01)
+        settings = dataclasses.replace(SMALL, device=device, iterations=100, learning_rate=0.01)
         found[device] = train.train([make(20)], tmp_path / f"{device}.pt", settings)["weights"]
         assert {value.device.type for value in found[device].values()} == {"cpu"}
     for name, value in found["cpu"].items():
@@ -124,7 +124,7 @@ def test_a_gpu_gives_the_same_model_within_rounding(tmp_path):
 
 def test_a_run_ends_as_soon_as_its_target_is_reached(tmp_path):
     steps = []
-    settings = dataclasses.replace(SMALL, iterations=600, rate=0.01, target_percent=10.0)
+    settings = dataclasses.replace(SMALL, iterations=600, learning_rate=0.01, target_percent=10.0)
     found = train.train([make(20)], tmp_path / "model.pt", settings, steps.append)["provenance"]
     assert found["validation_percent"] <= 10.0
     assert found["iterations_done"] == len(steps) < 600
@@ -153,7 +153,7 @@ def test_a_cut_run_of_another_optimizer_is_refused(tmp_path, monkeypatch):
 @pytest.mark.parametrize("network", ["lstm", "module-lstm"])
 def test_the_networks_bound_to_a_module_number_learn_too(tmp_path, network):
     data = make(20)
-    settings = dataclasses.replace(SMALL, network=network, iterations=600, rate=0.01, dropout=0.0)
+    settings = dataclasses.replace(SMALL, network=network, iterations=600, learning_rate=0.01, dropout=0.0)
     found = train.train([data], tmp_path / "model.pt", settings)
     assert (found["network"]["name"], found["network"]["modules"]) == (network, 3)
     assert found["provenance"]["network"] == network
@@ -166,8 +166,8 @@ def test_the_networks_bound_to_a_module_number_learn_too(tmp_path, network):
 
 
 def test_a_network_bound_to_a_module_number_has_no_shorter_robots():
-    with pytest.raises(UsageError, match=r"--shorter 0\.4: the network lstm is bound"):
-        dataclasses.replace(SMALL, network="lstm", shorter=0.4)
+    with pytest.raises(UsageError, match=r"--truncation-probability 0\.4: the network lstm is bound"):
+        dataclasses.replace(SMALL, network="lstm", truncation_probability=0.4)
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
@@ -243,7 +243,7 @@ def cut_at(iteration: int):
 
 @pytest.mark.parametrize("iteration", [4, 21, 59])
 def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, iteration):
-    settings = dataclasses.replace(SMALL, shorter=0.3)
+    settings = dataclasses.replace(SMALL, truncation_probability=0.3)
     straight = train.train([make()], tmp_path / "straight.pt", settings)
     out = tmp_path / "cut.pt"
     with pytest.raises(Cut):
@@ -295,7 +295,7 @@ def test_it_stops_early_and_keeps_the_best_weights(tmp_path):
     data = make()
     data.action[:] = np.random.default_rng(5).uniform(-1, 1, data.action.shape)
     told = []
-    settings = dataclasses.replace(SMALL, iterations=4000, rate=0.02, hidden=32, dropout=0.0)
+    settings = dataclasses.replace(SMALL, iterations=4000, learning_rate=0.02, hidden=32, dropout=0.0)
     found = train.train([data], tmp_path / "model.pt", settings, told.append)
     best = found["provenance"]["validation_percent"]
     first_with_best = next(t.iteration for t in told if t.validation_percent == best)

@@ -49,7 +49,7 @@ def test_killed_and_started_again_it_ends_with_the_same_model(folder):
     assert straight.returncode == 0, straight.stderr
     assert "module 2: actuation estimated within" in straight.stdout
     said = checkpoints.load(folder / "straight.pt")["provenance"]
-    assert (said["history"], said["batch"], said["shorter"], said["split"]) == (3, 8, 0.4, "blocks")
+    assert (said["history"], said["batch"], said["truncation_probability"], said["split"]) == (3, 8, 0.4, "blocks")
     victim = subprocess.Popen(command(folder, "d.h5", "--out", "m.pt", *QUICK), cwd=folder, stderr=subprocess.DEVNULL)
     resume = folder / "m.pt.resume"
     patience = time.monotonic() + 60
@@ -73,7 +73,7 @@ def test_the_network_asked_for_is_trained(folder):
     found = run(folder, "d.h5", "--out", "m.pt", "--network", "lstm", *QUICK)
     assert found.returncode == 0, found.stderr
     made = checkpoints.load(folder / "m.pt")
-    assert (made["network"]["name"], made["provenance"]["shorter"]) == ("lstm", 0.0)
+    assert (made["network"]["name"], made["provenance"]["truncation_probability"]) == ("lstm", 0.0)
     choice = next(option for option in train_cli.cli.params if option.name == "network").type
     assert tuple(choice.choices) == networks.NETWORKS
 
@@ -86,13 +86,15 @@ def test_the_network_asked_for_is_trained(folder):
         (["d.h5", "--out", "none/m.pt"], 2, "no folder none"),
         (["d.h5", "--minutes", "0"], 2, "minutes"),
         (["d.h5", "--minutes", "nan"], 2, "minutes"),
-        (["d.h5", "--rate", "nan"], 2, "--rate nan"),
-        (["d.h5", "--rate", "1e300"], 2, "rate"),
+        (["d.h5", "--learning-rate", "nan"], 2, "--learning-rate nan"),
+        (["d.h5", "--learning-rate", "1e300"], 2, "learning-rate"),
         (["d.h5", "--dropout", "nan"], 2, "--dropout nan"),
         (["d.h5", "--out", "."], 2, "."),
         (["d.h5", "--target-percent", "0"], 2, "target-percent"),
         (["d.h5", "--iterations", "2", "--target-percent", "0.1"], 77, "validation error"),
-        (["d.h5", "--network", "module-lstm", "--shorter", "0.4"], 2, "bound to its number of modules"),
+        (["d.h5", "--network", "module-lstm", "--truncation-probability", "0.4"], 2, "bound to its number of modules"),
+        (["d.h5", "--rate", "0.1"], 2, "--rate is now --learning-rate"),
+        (["d.h5", "--shorter", "0.1"], 2, "--shorter is now --truncation-probability"),
         ([], 2, "DATASET"),
     ],
 )

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import click
 
-from modsoft.runtime.entry_point import entry
+from modsoft.runtime.entry_point import Choice, entry
 from modsoft.runtime.locks import locked
 
-STAGES = ("collect", "train", "export", "estimate", "fly", "floors", "measure", "figures", "report")
+STAGES = ("collect", "train", "export", "estimate", "rollout", "oracle", "measure", "figures", "report")
 
 
 @click.group("modsoft-evaluate", context_settings={"show_default": True})
@@ -24,9 +24,13 @@ def cli() -> None:
 @click.option("--out", default="study", type=click.Path(path_type=Path, file_okay=False), help="Folder of the study.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes, of one thread each.  [default: cores]")
 @click.option("--quick", is_flag=True, help="All of it in miniature, in a minute: to see that it works, no more.")
-@click.option("--only", type=click.Choice(STAGES), help="One stage; what it needs must be there.")
+@click.option(
+    "--only",
+    type=Choice(STAGES, {"fly": "rollout", "floors": "oracle"}),
+    help="One stage; what it needs must be there.",
+)
 def study(out: Path, jobs: int | None, quick: bool, only: str | None) -> None:
-    """Collect, train, export and fly; write OUT/report.md, results.json, figures and every run.
+    """Collect, train, export, control; write OUT/report.md, results.json, figures and every run.
 
     \b
     Example:

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 def finding(plan: Plan, folder: Folder, jobs: int) -> Stage:
     """floors/*.npz, each a run like any other: what the robot does under the best actions found."""
     missing = [each for each in plan.floors if rollouts.meta(folder.floor(*each)) != identity(plan, *each)]
-    return Stage("floors", missing, partial(_find, plan, folder), partial(find_s, plan))
+    return Stage("oracle", missing, partial(_find, plan, folder), partial(find_s, plan))
 
 
 def find_s(plan: Plan, each: tuple[str, int]) -> float:

@@ -65,7 +65,7 @@ def flying(plan: Plan, folder: Folder, jobs: int) -> Stage:
         for alike in _alike(missing)
         for batch in (alike[first : first + TOGETHER] for first in range(0, len(alike), TOGETHER))
     ]
-    return Stage("fly", batches, partial(_fly, plan, folder), partial(fly_s, plan))
+    return Stage("rollout", batches, partial(_fly, plan, folder), partial(fly_s, plan))
 
 
 def fly_s(plan: Plan, batch: Sequence[Run]) -> float:

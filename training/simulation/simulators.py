@@ -53,7 +53,7 @@ def names() -> list[str]:
 def named(name: str, robot: Robot) -> Plant:
     """The plant of that name; `UsageError` where it does not run here, `RobotFileError` if it cannot be this robot."""
     if name not in names():
-        raise UsageError(f"the plant {name} does not run here; expected {', '.join(names())}")
+        raise UsageError(f"the simulator {name} does not run here; expected {', '.join(names())}")
     _check(robot)
     if name == "elastica":
         return Plant(name, by_elastica, together=1)
