@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import task
 from modsoft.training.simulation.fleet import simulated
 from modsoft.training.simulation.rollout import Pilot, angle_errors_deg, fly
@@ -14,7 +14,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "tools" / "models" / "pneumatic-
 
 def main() -> None:
     robot = robots.load("pneumatic-3")
-    model = Controller.load(Path(sys.argv[1]) if len(sys.argv) > 1 else SHIPPED)
+    model = Model.load(Path(sys.argv[1]) if len(sys.argv) > 1 else SHIPPED)
     model.check(robot)  # trained for a robot of this kind?
     desired = task("down", "pneumatic", robot.modules)  # (K, N, 3), one configuration a control step
     arm = simulated("pneumatic", robot.modules, 1)

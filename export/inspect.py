@@ -9,13 +9,13 @@ from typing import Any
 import msgspec
 import onnx
 
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.entry_point import printable
 
 
 def print_model(path: Path) -> None:
     """Proves the file as the runtime does (`ModelError` otherwise), then prints its graph and its description."""
-    said = Controller.load(path).description
+    said = Model.load(path).description
     model = onnx.load(path, load_external_data=False)
     operators = Counter(node.op_type for node in model.graph.node)
     print(f"{path}: {path.stat().st_size} bytes; seal, description and golden pairs hold")

@@ -12,7 +12,7 @@ from modsoft.export import bilstm_graph, load, parity
 from modsoft.export.nodes import Weights
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control import model_file
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.model_file import Description, Golden, Network
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.files import check_not_input, check_writable, written
@@ -59,7 +59,7 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
         temporary.write_bytes(content)
         try:
             report = parity.verify(temporary, network, sizes, expected)
-            described = Controller.load(temporary).description  # as the lab PC will, golden pairs included
+            described = Model.load(temporary).description  # as the lab PC will, golden pairs included
         except ModelError as error:
             raise ModelError(f"{out} not written: {str(error).replace(str(temporary), out.name)}") from error
     return Exported(out, described, report)

@@ -12,27 +12,19 @@ from numpy.typing import NDArray
 
 from modsoft.runtime.board.protocol import CHANNELS, State, Status
 from modsoft.runtime.clock import SLICE_S, Tick, Ticker
-from modsoft.runtime.control.actuation import channel_pressures_bar, limited
+from modsoft.runtime.control.actuation import channel_pressures_bar
+from modsoft.runtime.control.controller import Controller, Policy
 from modsoft.runtime.control.correction import Correction, NoCorrection
-from modsoft.runtime.control.features import Window, state_of
 from modsoft.runtime.control.tasks import ahead
 from modsoft.runtime.errors import LostInRun
 from modsoft.runtime.robot import Robot
-from modsoft.runtime.safety import FrameJudge, Guard, Judgement, check_actuation
+from modsoft.runtime.safety import FrameJudge, Guard, Judgement
 from modsoft.runtime.statistics import Tally
 from modsoft.runtime.stop import Stop
 from modsoft.runtime.tracking.frame import Frame, Slot
 from modsoft.runtime.warmup import WarmUp
 
 Array = NDArray[np.float64]
-
-
-class Model(Protocol):
-    """What is used of `modsoft.runtime.control.model.Controller`."""
-
-    @property
-    def history(self) -> int: ...
-    def actuate(self, features: Array) -> Array: ...
 
 
 class Valves(Protocol):
@@ -61,7 +53,7 @@ class Loop:
     model for row k + 1, and the error counts where the robot is at the start of step k. `correction`: a new one."""
 
     robot: Robot
-    model: Model
+    model: Policy
     desired: Array
     slot: Slot
     judge: FrameJudge
@@ -78,13 +70,10 @@ class Loop:
 
         Returns one period after the last step. Whatever ends it earlier is raised; venting is the caller's.
         """
-        robot, kind = self.robot, self.robot.robot.kind
-        guard = Guard(robot)
-        state = state_of(rest, kind)
-        applied = np.zeros((robot.modules, robot.action_size))
-        window = Window(self.model.history, state, robot.action_size)
+        robot, guard = self.robot, Guard(self.robot)
+        controller = Controller(robot, self.model, rest, self.correction)
         # The history begins with actuation 0, so the robot is given it for one period before the first step.
-        bar = channel_pressures_bar(robot, applied, CHANNELS)
+        bar = channel_pressures_bar(robot, controller.applied, CHANNELS)
         self._idle()  # arming takes a second: who asked to stop in it must not see a valve open first
         began_ns = _ns(self.ticker.now())  # before it: no valve may be open earlier
         sequence: int | None = self.valves.set_pressures(0, bar)
@@ -95,15 +84,16 @@ class Loop:
         warm_up = self.warm_up
 
         def prepare(left_s: float) -> float:
-            return warm_up.before(left_s, self.slot.latest(), window, applied) if warm_up is not None else left_s
+            if warm_up is None:
+                return left_s
+            return warm_up.before(left_s, self.slot.latest(), controller.window, controller.applied)
 
         while True:
             tick = self.ticker.next(self._idle, prepare)
             acknowledged = self._acknowledged(step, sequence)
             guard.missed(min(tick.index, len(self.desired)) - step - 1)
             for _ in range(tick.missed):  # the valves held what they had
-                window.observe(state)
-                window.applied(applied)
+                controller.skip()
             if tick.index >= len(self.desired):
                 self.log({"event": "done", "mono_ns": _ns(tick.start_s), "acknowledged": acknowledged})
                 return
@@ -113,32 +103,20 @@ class Loop:
             desired = self.desired[step]
             # What the step begins with is read before the set-points change it, the line is made after they are sent.
             wall, board, link = datetime.now(UTC), self._board(), self.valves.statistics
-            outcome: dict[str, Any] = {"sent": False, "aim": None, "raw": None, "actuation": applied}
-            outcome |= {"commanded_bar": None}
+            outcome: dict[str, Any] = {"sent": False, "actuation": controller.applied, "commanded_bar": None}
             try:
                 guard.frame(judged)
-                actuation = applied  # held where there is no good frame
-                if judged.configuration is not None:
-                    state = state_of(judged.configuration, kind)
-                window.observe(state)
-                if judged.configuration is not None:
-                    outcome["aim"] = aim = self.correction.aim(targets[step], desired, judged.configuration)
-                    outcome["raw"] = raw = self.model.actuate(window.features(state_of(aim, kind)))
-                    check_actuation(raw)
-                    actuation = limited(raw, applied, robot.limits.largest_actuation_step)
-                    self.correction.answered(raw, actuation)
+                actuation = controller.compute(judged.configuration, desired, targets[step])
                 bar = channel_pressures_bar(robot, actuation, CHANNELS)
                 if not self.ticker.too_late(step):
                     sequence = self.valves.set_pressures(step + 1, bar)
                     self.ticker.sent()
-                    applied = actuation
-                    outcome |= {"sent": True, "actuation": applied, "commanded_bar": bar}
+                    outcome |= {"sent": True, "actuation": actuation, "commanded_bar": bar}
                     guard.on_time()
                 else:
                     sequence = None  # the acknowledgement of the step before is not this one's
                     self.valves.beat(step + 1)
                     guard.missed(1)
-                window.applied(applied)
             finally:  # the step that ended a run is the one that everybody wants to see
                 outcome["step_ms"] = (self.ticker.now() - tick.start_s) * 1e3
                 line = {
@@ -147,9 +125,12 @@ class Loop:
                     "board": board,
                     "acknowledged": acknowledged,
                     "link": link,
+                    "aim": controller.target,
+                    "raw": controller.raw,
                     **outcome,
                 }
                 self.log(line)
+            controller.record(outcome["actuation"])
             self.tally.add(line, tick, judged)
             if warm_up is not None:
                 warm_up.step_took(outcome["step_ms"] * 1e-3)

@@ -29,7 +29,7 @@ from modsoft.runtime.board.protocol import VentMode
 from modsoft.runtime.clock import Ticker, spinning
 from modsoft.runtime.control import correction
 from modsoft.runtime.control.features import bending_angle_deg
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import load_task, task_of
 from modsoft.runtime.errors import (
     INTERNAL_EXIT_CODE,
@@ -242,16 +242,16 @@ def _port(told: str) -> str:
     return find_port(told)
 
 
-def _model(path: Path, robot: Robot) -> tuple[Controller, str]:
+def _model(path: Path, robot: Robot) -> tuple[Model, str]:
     """The controller, proven and of this robot, and its file's SHA-256."""
     if not path.is_file():
         raise ModelError(f"no model {str(path)!r} here; give --model FILE, a file that modsoft-export wrote")
-    controller = Controller.load(path)
+    controller = Model.load(path)
     controller.check(robot)
     return controller, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _described(controller: Controller) -> dict[str, object]:
+def _described(controller: Model) -> dict[str, object]:
     """What the model says about itself, without the golden pairs."""
     said = msgspec.to_builtins(controller.description)
     said.pop("golden", None)

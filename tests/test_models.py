@@ -7,7 +7,7 @@ import pytest
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control import tasks
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.training.simulation import fleet_kernel, rollout
 from modsoft.training.simulation.fleet import Fleet
 from modsoft.training.simulation.rollout import Pilot
@@ -23,7 +23,7 @@ needs_fleet = pytest.mark.skipif(not fleet_kernel.variants(), reason="the fleet'
     [("pneumatic-3", "pneumatic-3"), ("pneumatic-3", "pneumatic-2"), ("cable-4", "cable-4"), ("cable-4", "cable-6")],
 )
 def test_a_shipped_model_is_of_its_robots_and_says_how_it_was_made(file, robot):
-    controller = Controller.load(MODELS / f"{file}.onnx")
+    controller = Model.load(MODELS / f"{file}.onnx")
     controller.check(robots.load(robot))
     said = controller.description.provenance
     assert {"data_sha256", "iterations_done", "seed", "strategy", "code_version"} <= said.keys()
@@ -39,7 +39,7 @@ def test_a_shipped_model_drives_its_robot(file, robot, task, most):
     """most: of the mean error of any module, degrees or percent, over the first 60 steps; far more than was measured,
     far less than that of a model that does not drive."""
     robot = robots.load(robot)
-    controller = Controller.load(MODELS / f"{file}.onnx")
+    controller = Model.load(MODELS / f"{file}.onnx")
     desired = tasks.task(task, robot.robot.kind, robot.modules)[:60]
     pilot = Pilot(controller.actuate, controller.history, desired)
     (flight,) = rollout.fly(robot, Fleet(robot.robot.kind, robot.modules, 1), [pilot])

@@ -29,7 +29,7 @@ from modsoft.hil.post_fault_checks import Injected, Ran
 from modsoft.hil.record import board_in_words, firmware_sha256
 from modsoft.hil.soak import Soak, SoakRig
 from modsoft.runtime import log
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import LostInRun, UsageError
 from modsoft.runtime.files import written
@@ -145,7 +145,7 @@ def cli(
     minutes: float, every_s: float, seed: int, model: Path | None, out: Path, report: Path | None, proofs: bool
 ) -> int:
     model = model or shipped.model(ROBOT)
-    Controller.load(model)
+    Model.load(model)
     build(choose())
     began, load = datetime.now(UTC), os.getloadavg()[1]
     folder = out / f"{began:%Y%m%dT%H%M%SZ}"

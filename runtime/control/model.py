@@ -1,7 +1,7 @@
 """The controller: the exported biLSTM unit, run over all modules of the robot in one go or as a chain of units, or an
 exported network that is bound to its number of modules.
 
-`Controller.load` believes nothing: the seal, the description, the graph's border and the golden pairs are all proven
+`Model.load` believes nothing: the seal, the description, the graph's border and the golden pairs are all proven
 before the first control step, and `check` proves that model and robot belong together.
 """
 
@@ -142,7 +142,7 @@ def unit_of(model: bytes, where: str = "model") -> Unit | BoundUnit:
     return Unit(session, where) if session.get_overridable_initializers() else BoundUnit(session, where)
 
 
-class Controller:
+class Model:
     """A model file, proven and ready to run. `description` says what it is, `history` is its T."""
 
     def __init__(self, unit: Unit | BoundUnit, description: Description):
@@ -151,7 +151,7 @@ class Controller:
         self.where = unit.where
 
     @classmethod
-    def load(cls, path: str | Path) -> Controller:
+    def load(cls, path: str | Path) -> Model:
         """Opens a model file; `ModelError` for one that is damaged, of another schema, at odds with its own
         description, or that answers the golden pairs otherwise than torch did."""
         path = Path(path)

@@ -10,7 +10,7 @@ from onnx.reference import ReferenceEvaluator
 from modsoft.export import load, write
 from modsoft.export.write import export
 from modsoft.runtime import robot as robots
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.model_file import ACTUATION, FEATURES
 from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
@@ -37,7 +37,7 @@ def features(modules=N, seed=0):
 def test_torch_onnxruntime_and_onnx_agree(exported, name):
     checkpoint, made = exported[name]
     network = checkpoints.network_of(checkpoints.load(checkpoint))
-    evaluator, controller = ReferenceEvaluator(onnx.load(made.path)), Controller.load(made.path)
+    evaluator, controller = ReferenceEvaluator(onnx.load(made.path)), Model.load(made.path)
     for seed in range(5):
         x = features(seed=seed)
         with torch.no_grad():
@@ -57,13 +57,13 @@ def test_description_says_what_it_is_bound_to(exported, name):
 @pytest.mark.parametrize("name", BOUND)
 @pytest.mark.parametrize("modules", [2, 3, 5, 6])
 def test_another_number_of_modules_is_refused(exported, name, modules):
-    controller = Controller.load(exported[name][1].path)
+    controller = Model.load(exported[name][1].path)
     with pytest.raises(ModelError, match=f"of {modules} modules; the network {name} is bound to 4, a biLSTM serves"):
         controller.actuate(features(modules))
 
 
 def test_check_refuses_a_robot_of_another_number_of_modules(exported):
-    controller = Controller.load(exported["lstm"][1].path)
+    controller = Model.load(exported["lstm"][1].path)
     controller.check(robots.load("cable-4"))
     with pytest.raises(ModelError, match="trained for modules 4; robot cable-6 has modules 6"):
         controller.check(robots.load("cable-6"))

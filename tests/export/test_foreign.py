@@ -8,7 +8,7 @@ import torch
 
 from modsoft.export.write import export
 from modsoft.runtime import robot as robots
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.training import networks
 
@@ -76,7 +76,7 @@ def test_the_advice_works_when_it_is_followed(tmp_path, weights, plain, kind):
 def test_half_precision_becomes_float32(tmp_path, weights, kind):
     torch.save({name: value.to(kind) for name, value in weights.items()}, tmp_path / "half.pt")
     (tmp_path / "meta.toml").write_bytes(codecs.BOM_UTF16_LE + META.encode("utf-16-le"))
-    Controller.load(export(tmp_path / "half.pt", meta=tmp_path / "meta.toml").path)
+    Model.load(export(tmp_path / "half.pt", meta=tmp_path / "meta.toml").path)
 
 
 def test_the_robot_file_is_beside_the_meta_file(tmp_path, monkeypatch, weights):

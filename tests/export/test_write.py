@@ -10,7 +10,7 @@ import torch
 
 from modsoft.export import cli, write
 from modsoft.export.write import export
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.errors import ModelError, OutputError, UsageError
 from modsoft.training import checkpoint as checkpoints
 
@@ -52,7 +52,7 @@ def test_full_size(tmp_path, make_checkpoint, robot, history, gain):
     assert max(report.chain.values()) <= report.bound
     assert max(report.one_sweep_fewer.values()) > 10 * max(report.chain.values())
     network = checkpoints.network_of(checkpoints.load(checkpoint))
-    controller = Controller.load(exported.path)
+    controller = Model.load(exported.path)
     assert controller.history == history
     x = np.random.default_rng(5).uniform(-1, 1, (9, controller.unit.feature_size))  # no N that was checked
     with torch.no_grad():
@@ -180,7 +180,7 @@ def test_bare_state_dict_needs_a_meta_file(bare):
     assert export(weights, meta=meta).description.weights_sha256 == (
         export(weights.with_name("whole.pt")).description.weights_sha256
     )
-    assert Controller.load(weights.with_suffix(".onnx")).description.provenance == {"from": "elsewhere"}
+    assert Model.load(weights.with_suffix(".onnx")).description.provenance == {"from": "elsewhere"}
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,13 @@ from spoilt_models import onnx_description, redescribed
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control import features as feature_layout
 from modsoft.runtime.control import model_file as model_files
-from modsoft.runtime.control.model import Controller, unit_of
+from modsoft.runtime.control.model import Model, unit_of
 from modsoft.runtime.errors import ModelError
 
 
 @pytest.fixture
 def controller(model_file):
-    return Controller.load(model_file)
+    return Model.load(model_file)
 
 
 def features(modules, seed=0):
@@ -37,7 +37,7 @@ def test_same_features_same_actuation(controller, model_file):
     first = controller.actuate(features(3))
     controller.actuate(features(6))  # nothing is remembered from step to step
     np.testing.assert_array_equal(controller.actuate(features(3)), first)
-    np.testing.assert_array_equal(Controller.load(model_file).actuate(features(3)), first)
+    np.testing.assert_array_equal(Model.load(model_file).actuate(features(3)), first)
 
 
 def test_takes_what_the_window_gives(controller):
@@ -101,7 +101,7 @@ def test_every_bit_of_the_description_and_the_seal_counts(model_file, tmp_path):
 def test_two_seals_are_none(model_file, tmp_path):
     (tmp_path / "model.onnx").write_bytes(model_file.read_bytes() * 2)
     with pytest.raises(ModelError, match="no seal"):
-        Controller.load(tmp_path / "model.onnx")
+        Model.load(tmp_path / "model.onnx")
 
 
 @pytest.mark.parametrize(
@@ -116,14 +116,14 @@ def test_two_seals_are_none(model_file, tmp_path):
 def test_other_files(tmp_path, content, message):
     (tmp_path / "model.onnx").write_bytes(content)
     with pytest.raises(ModelError, match=message) as refused:
-        Controller.load(tmp_path / "model.onnx")
+        Model.load(tmp_path / "model.onnx")
     assert "\n" not in str(refused.value)
 
 
 def test_no_file(tmp_path):
     for path, message in ((tmp_path / "model.onnx", "no model file"), (tmp_path, "found a folder")):
         with pytest.raises(ModelError, match=message):
-            Controller.load(path)
+            Model.load(path)
 
 
 @pytest.mark.parametrize(
@@ -149,11 +149,11 @@ def test_no_file(tmp_path):
 )
 def test_a_description_that_does_not_hold(model_file, tmp_path, change, message):
     with pytest.raises(ModelError, match=message):
-        Controller.load(redescribed(model_file, tmp_path / "model.onnx", change))
+        Model.load(redescribed(model_file, tmp_path / "model.onnx", change))
 
 
 def test_a_sound_copy_loads(model_file, tmp_path):
-    Controller.load(redescribed(model_file, tmp_path / "model.onnx", lambda table: None))
+    Model.load(redescribed(model_file, tmp_path / "model.onnx", lambda table: None))
 
 
 def test_golden_pairs_find_other_weights_under_a_good_seal(model_file, tmp_path):
@@ -168,7 +168,7 @@ def test_golden_pairs_find_other_weights_under_a_good_seal(model_file, tmp_path)
     content = model.SerializeToString().replace(table["file_sha256"].encode(), model_files.UNSEALED.encode())
     (tmp_path / "model.onnx").write_bytes(model_files.sealed(content))
     with pytest.raises(ModelError, match="golden pair"):
-        Controller.load(tmp_path / "model.onnx")
+        Model.load(tmp_path / "model.onnx")
 
 
 def test_another_border_is_refused(model_file):
@@ -181,8 +181,8 @@ def test_another_border_is_refused(model_file):
 def test_needs_no_torch_and_no_onnx(model_file):
     script = (
         "import sys\n"
-        "from modsoft.runtime.control.model import Controller\n"
-        f"Controller.load({str(model_file)!r}).warm_up(3)\n"
+        "from modsoft.runtime.control.model import Model\n"
+        f"Model.load({str(model_file)!r}).warm_up(3)\n"
         "sys.exit(any(name in sys.modules for name in ('torch', 'onnx', 'elastica')))"
     )
     subprocess.run([sys.executable, "-c", script], check=True)

@@ -13,7 +13,7 @@ from modsoft.export import inspect
 from modsoft.hil import cli as hil_cli
 from modsoft.runtime import cli as runtime_cli
 from modsoft.runtime.control import model_file as model_files
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.ort import onnxruntime
 
 
@@ -56,11 +56,11 @@ def test_a_model_with_weights_in_another_file(tmp_path, monkeypatch, model_file,
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
     tensors = in_a_branch(model) if place == "branch" else [largest_weight(model)]
     sealed_at(path, model, onnx_description(model))
-    Controller.load(path)  # so far it is only an odd model
+    Model.load(path)  # so far it is only an odd model
     for tensor in tensors:
         outside(tensor, location.format(folder=tmp_path, name=tmp_path.name))
     sealed_at(path, model, onnx_description(model))
-    refused(Controller.load, path, "onnxruntime .* refuses it")
+    refused(Model.load, path, "onnxruntime .* refuses it")
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_description_that_breaks_its_reader(tmp_path, model_file, refused, bef
         content = model.SerializeToString().replace(before + mark.encode(), after)
     seal = model_files._SEAL.search(content)[1]
     (tmp_path / "model.onnx").write_bytes(model_files.sealed(content.replace(seal, model_files.UNSEALED.encode())))
-    refused(Controller.load, tmp_path / "model.onnx", "UTF-8|description cannot be read|refuses it")
+    refused(Model.load, tmp_path / "model.onnx", "UTF-8|description cannot be read|refuses it")
 
 
 def test_a_model_with_weights_at_an_address_of_the_memory(tmp_path, monkeypatch, model_file, refused):
@@ -126,7 +126,7 @@ def test_a_model_with_weights_at_an_address_of_the_memory(tmp_path, monkeypatch,
     outside(tensor, "weights.bin")
     tensor.external_data[0].value, tensor.external_data[1].value = "*/_ORT_MEM_ADDR_/*", str(numbers.ctypes.data)
     sealed_at(path, model, onnx_description(model))
-    refused(Controller.load, path, "onnxruntime .* refuses it")
+    refused(Model.load, path, "onnxruntime .* refuses it")
 
 
 def test_a_model_in_the_other_format_of_onnxruntime(tmp_path, model_file, refused):
@@ -139,4 +139,4 @@ def test_a_model_in_the_other_format_of_onnxruntime(tmp_path, model_file, refuse
     onnxruntime.InferenceSession(content)  # whoever does not say which format takes both
     seal = model_files._SEAL.search(content)[1]
     path.write_bytes(model_files.sealed(content.replace(seal, model_files.UNSEALED.encode())))
-    refused(Controller.load, path, "onnxruntime .* refuses it")
+    refused(Model.load, path, "onnxruntime .* refuses it")

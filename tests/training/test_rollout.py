@@ -7,6 +7,7 @@ import torch
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control import correction, tasks
 from modsoft.runtime.control.features import bending_angle_deg, feature_names, from_angles_deg, state_of
+from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint
 from modsoft.training.networks import BiLSTM
 from modsoft.training.simulation import rollout
@@ -64,7 +65,7 @@ def test_the_controller_is_fed_as_by_the_runtime_and_held_to_the_largest_step():
 
     def controller(features):
         seen.append(features)
-        return np.array([[5.0], [-0.3]])
+        return np.array([[2.9], [-0.3]])
 
     arms = RobotsOfAngles(2)
     desired = from_angles_deg(np.outer(np.arange(5), [10.0, 20.0]))
@@ -135,3 +136,10 @@ def test_a_checkpoint_becomes_a_controller_of_any_module_number():
         with torch.no_grad():
             expected = network(torch.tensor(features, dtype=torch.float32)[None])[0].numpy()
         np.testing.assert_allclose(actuate(features), expected, atol=1e-6)
+
+
+def test_an_answer_that_the_runtime_refuses_is_refused_in_a_rollout_too():
+    robot = robots.load("pneumatic-2")
+    desired = from_angles_deg(np.zeros((5, 2)))
+    with pytest.raises(ModelError, match="never beyond 3"):
+        rollout.fly(robot, RobotsOfAngles(2), [Pilot(lambda features: np.array([[3.1], [0.0]]), 4, desired)])

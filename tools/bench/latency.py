@@ -43,7 +43,7 @@ from modsoft.runtime.board.ports import open_port
 from modsoft.runtime.board.protocol import CHANNELS, Set, encode
 from modsoft.runtime.clock import Ticker, spinning
 from modsoft.runtime.control.features import from_angles_deg
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.ort import onnxruntime
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.loop import Loop
@@ -164,7 +164,7 @@ def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict
             tracker.send({"poses": swinging(modules, 0.0)})
             slot = StampedSlot(stamps)
             reader = Reader(NDI("polaris", str(port), tools, modules + 1), slot)
-            controller = Controller.load(model)
+            controller = Model.load(model)
             controller.warm_up(modules)
             board = Board(StampedPort(open_port(emulated.port, robot.serial.baud), frame_bytes, written), emulated.port)
             board.arm(robot)

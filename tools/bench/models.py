@@ -13,7 +13,7 @@ import click
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control import correction, tasks
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.entry_point import entry
 from modsoft.training.simulation.fleet import simulated
 from modsoft.training.simulation.rollout import Pilot, angle_errors_deg, configuration_errors_percent, fly
@@ -26,7 +26,7 @@ CORRECTIONS = ("none", "integral")
 
 def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]:
     """A row for each task and correction."""
-    robot, controller = robots.load(name), Controller.load(MODELS / f"{model}.onnx")
+    robot, controller = robots.load(name), Model.load(MODELS / f"{model}.onnx")
     kind = robot.robot.kind
     flown = [(task, each) for task in tasks.available(kind, robot.modules) for each in CORRECTIONS]
     pilots = []

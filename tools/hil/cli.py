@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import load_task
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import DeviceAbsent
@@ -76,7 +76,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     report_folder.check(report)
     robot = load_robot(robot_file)
     desired = load_task(task, robot)
-    Controller.load(model).check(robot)  # the runtime does it too; here it saves the start of the rig
+    Model.load(model).check(robot)  # the runtime does it too; here it saves the start of the rig
     asked = desired[:steps]
     count = len(asked)
     build(choose(board))

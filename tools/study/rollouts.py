@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.control import actuation, features, model, tasks
+from modsoft.runtime.control import actuation, controller, features, model, tasks
 from modsoft.runtime.control import correction as corrections
-from modsoft.runtime.control.model import Controller
+from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import task
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import written
@@ -34,6 +34,7 @@ TOGETHER = 16  # robots of a batch: two blocks of the kernel's widest vectors
 # The code that shapes a run beside the model and the kernel.
 SHAPES: tuple[ModuleType, ...] = (
     actuation,
+    controller,
     features,
     model,
     corrections,
@@ -113,7 +114,7 @@ def desired_of(plan: Plan, name: str, modules: int) -> Array:
 def _fly(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: Told) -> None:
     first = batch[0]
     robot = robots.load(f"cable-{first.modules}")
-    models = {run.model: Controller.load(folder.onnx(run.model)) for run in batch}
+    models = {run.model: Model.load(folder.onnx(run.model)) for run in batch}
     for each in models.values():
         each.check(robot)
     pilots = [

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from modsoft.runtime.control.actuation import limited
+from modsoft.runtime.control.controller import Controller
 from modsoft.runtime.control.correction import Correction, NoCorrection
-from modsoft.runtime.control.features import Window, bending_error_deg, state_of
+from modsoft.runtime.control.features import bending_error_deg
 from modsoft.runtime.control.tasks import ahead
 from modsoft.runtime.robot import Robot
 from modsoft.training.checkpoint import network_of
@@ -56,31 +56,23 @@ class Flight(NamedTuple):
 def fly(robot: Robot, robots: Fleet | Arms, pilots: Sequence[Pilot]) -> list[Flight]:
     """Drives `robots`, at rest, each by its own pilot as the runtime would (`modsoft.runtime.loop`): at step k the
     network is asked for desired[k + 1], the state at the end of the period. All tasks have the same length K."""
-    kind, steps = robot.robot.kind, len(pilots[0].desired)
+    steps = len(pilots[0].desired)
     if len(pilots) != robots.count or any(len(pilot.desired) != steps for pilot in pilots):
         raise ValueError(f"{len(pilots)} pilots for {robots.count} robots; expected one each, of tasks of one length")
     actions = np.zeros((steps, len(pilots), robot.modules, robot.action_size))
-    told = [(robots.configuration, robots.positions, robots.directors)]
-    state = [state_of(configuration, kind) for configuration in told[0][0]]
-    windows = [Window(pilot.history, at_rest, robot.action_size) for pilot, at_rest in zip(pilots, state, strict=True)]
+    states = [(robots.configuration, robots.positions, robots.directors)]
+    controllers = [
+        Controller(robot, pilot, rest, pilot.correction) for pilot, rest in zip(pilots, states[0][0], strict=True)
+    ]
     targets = [ahead(pilot.desired) for pilot in pilots]
     for k in range(steps):
-        for b, pilot in enumerate(pilots):
-            before = actions[k - 1, b] if k else np.zeros_like(actions[k, b])
-            measured = pilot.measure(k, told[-1][0][b])
-            if measured is not None:
-                state[b] = state_of(measured, kind)
-            windows[b].observe(state[b])
-            actions[k, b] = before
-            if measured is not None:
-                aim = pilot.correction.aim(targets[b][k], pilot.desired[k], measured)
-                raw = pilot.actuate(windows[b].features(state_of(aim, kind)))
-                actions[k, b] = limited(raw, before, robot.limits.largest_actuation_step)
-                pilot.correction.answered(raw, actions[k, b])
-            windows[b].applied(actions[k, b])
+        for b, (pilot, controller) in enumerate(zip(pilots, controllers, strict=True)):
+            measured = pilot.measure(k, states[-1][0][b])
+            actions[k, b] = controller.compute(measured, pilot.desired[k], targets[b][k])
+            controller.record(actions[k, b])
         robots.step(actions[k], robot.loop.period_s)
-        told.append((robots.configuration, robots.positions, robots.directors))
-    configuration, positions, directors = (np.stack(values, axis=1) for values in zip(*told, strict=True))
+        states.append((robots.configuration, robots.positions, robots.directors))
+    configuration, positions, directors = (np.stack(values, axis=1) for values in zip(*states, strict=True))
     return [Flight(configuration[b], actions[:, b], positions[b], directors[b]) for b in range(len(pilots))]
 
 
