@@ -102,6 +102,7 @@ class Fleet:
         self._constants = self._with_arrays(damping)
         # Newtons of a pascal at weight 1.
         self._section_m2 = self.plant.actuators.area_ratio * area
+        self._thread_count = threads
         self._threads = ThreadPoolExecutor(threads) if threads > 1 else None
         self._rest = self._settled()
         blocks = -(-count // self.lanes)
@@ -205,7 +206,9 @@ class Fleet:
         if self._threads is None:
             advance(slice(None))
         else:
-            list(self._threads.map(advance, [slice(block, block + 1) for block in range(len(state))]))
+            # A contiguous part each: handed out block by block, two threads gained 1.5 times in place of 1.9.
+            borders = np.linspace(0, len(state), self._thread_count + 1).round().astype(int)
+            list(self._threads.map(advance, map(slice, borders[:-1], borders[1:])))
 
     def _settled(self) -> Snapshot:
         """One robot at rest, hanging under its weight."""
