@@ -7,7 +7,7 @@ from modsoft.runtime import robot as robots
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import task
 from modsoft.training.simulation.fleet import simulated
-from modsoft.training.simulation.rollout import Pilot, angle_errors_deg, fly
+from modsoft.training.simulation.rollout import ControllerSetup, angle_errors_deg, rollout
 
 SHIPPED = Path(__file__).resolve().parents[1] / "tools" / "models" / "pneumatic-3.onnx"
 
@@ -18,7 +18,7 @@ def main() -> None:
     model.check(robot)  # trained for a robot of this kind?
     desired = task("down", "pneumatic", robot.modules)  # (K, N, 3), one configuration a control step
     arm = simulated("pneumatic", robot.modules, 1)
-    [run] = fly(robot, arm, [Pilot(model.actuate, model.history, desired)])
+    [run] = rollout(robot, arm, [ControllerSetup(model.actuate, model.history, desired)])
     for module, error in enumerate(angle_errors_deg(run.configuration, desired).mean(axis=0), start=1):
         print(f"module {module}: mean error of the bending angle {error:.2f} degrees")
 

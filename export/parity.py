@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from modsoft.export import bilstm_graph
 from modsoft.export.nodes import Weights
 from modsoft.runtime.control.features import labels
-from modsoft.runtime.control.model import BoundUnit, Unit, unit_of
+from modsoft.runtime.control.model import FixedSizeUnit, Unit, unit_of
 from modsoft.runtime.control.model_file import FEATURES, FROM_NEIGHBOURS, IR_VERSION, OPSET, Network
 from modsoft.runtime.errors import ModelError
 
@@ -173,7 +173,7 @@ def check_weights(path: Path, weights: Weights, sizes: Network) -> None:
             raise ModelError(f"weight {name}: {changed} of {expected.size} values are not the checkpoint's")
 
 
-def check_fused(unit: Unit | BoundUnit, expected: Reference) -> dict[int, float]:
+def check_fused(unit: Unit | FixedSizeUnit, expected: Reference) -> dict[int, float]:
     """All modules in one run give torch's actuation."""
     found = {n: [unit.whole(x) for x in draws] for n, draws in expected.features.items()}
     return _within(expected.error(found), expected.bound, "all modules in one run")
@@ -196,7 +196,7 @@ def check_chain(unit: Unit, expected: Reference) -> tuple[dict[int, float], dict
     return chain, fewer
 
 
-def check_guard(unit: Unit | BoundUnit, expected: Reference) -> None:
+def check_guard(unit: Unit | FixedSizeUnit, expected: Reference) -> None:
     """A NaN or an infinity in any feature or any neighbour's state gives NaN in every output at every module."""
     draws = expected.features[3 if unit.modules is None else unit.modules]
     features = draws[0].astype(np.float32)
@@ -215,7 +215,7 @@ def check_guard(unit: Unit | BoundUnit, expected: Reference) -> None:
                 _all_nan(unit, {FEATURES: features[None], **states, name: spoilt}, f"{name} of layer {layer + 1}")
 
 
-def _all_nan(unit: Unit | BoundUnit, inputs: dict[str, NDArray[np.float32]], where: str) -> None:
+def _all_nan(unit: Unit | FixedSizeUnit, inputs: dict[str, NDArray[np.float32]], where: str) -> None:
     names = [output.name for output in unit.session.get_outputs()]
     for name, output in zip(names, unit.session.run(None, inputs), strict=True):
         if not np.isnan(output).all():

@@ -53,7 +53,7 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
         text = msgspec.json.encode(described).decode()
     except TypeError as error:
         raise ModelError(f"{model}: provenance that is no plain value ({error})") from error
-    content = model_file.sealed(bilstm_graph.build(weights, sizes, text).SerializeToString())
+    content = model_file.with_checksum(bilstm_graph.build(weights, sizes, text).SerializeToString())
 
     with written(out) as temporary:
         temporary.write_bytes(content)

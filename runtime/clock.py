@@ -41,7 +41,7 @@ class Tick:
 
 
 class Ticker:
-    """Slot k is due at start + k * period, computed anew each time so that nothing adds up.
+    """LatestFrame k is due at start + k * period, computed anew each time so that nothing adds up.
 
     A slot may begin, and send, until half a period after it was due; later than that it is skipped. It also waits for
     half a period after the last command, which may have gone out late for a process that was halted just then. So two
@@ -64,7 +64,7 @@ class Ticker:
         self._index = -1
 
     def start(self, delay_s: float = 0.0) -> None:
-        """Slot 0 is due `delay_s` from now."""
+        """LatestFrame 0 is due `delay_s` from now."""
         self._start_s = self.now() + delay_s
         self._index = -1
 

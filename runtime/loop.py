@@ -15,13 +15,13 @@ from modsoft.runtime.clock import SLICE_S, Tick, Ticker
 from modsoft.runtime.control.actuation import channel_pressures_bar
 from modsoft.runtime.control.controller import Controller, Policy
 from modsoft.runtime.control.correction import Correction, NoCorrection
-from modsoft.runtime.control.tasks import ahead
+from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.errors import LostInRun
 from modsoft.runtime.robot import Robot
-from modsoft.runtime.safety import FrameJudge, Guard, Judgement
-from modsoft.runtime.statistics import Tally
+from modsoft.runtime.safety import FaultCounter, FrameCheck, FrameValidator
+from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Stop
-from modsoft.runtime.tracking.frame import Frame, Slot
+from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 from modsoft.runtime.warmup import WarmUp
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class Valves(Protocol):
     def statistics(self) -> dict[str, int]: ...
     def check(self) -> None: ...
     def set_pressures(self, tick: int, pressures_bar: Array) -> int: ...
-    def beat(self, tick: int) -> None: ...
+    def publish_tick(self, tick: int) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ class Loop:
     robot: Robot
     model: Policy
     desired: Array
-    slot: Slot
-    judge: FrameJudge
+    slot: LatestFrame
+    judge: FrameValidator
     valves: Valves
     ticker: Ticker
     stop: Stop
     log: Callable[[dict[str, Any]], None]
-    tally: Tally
+    tally: TickStatistics
     correction: Correction = field(default_factory=NoCorrection)
     warm_up: WarmUp | None = None
 
@@ -70,7 +70,7 @@ class Loop:
 
         Returns one period after the last step. Whatever ends it earlier is raised; venting is the caller's.
         """
-        robot, guard = self.robot, Guard(self.robot)
+        robot, guard = self.robot, FaultCounter(self.robot)
         controller = Controller(robot, self.model, rest, self.correction)
         # The history begins with actuation 0, so the robot is given it for one period before the first step.
         bar = channel_pressures_bar(robot, controller.applied, CHANNELS)
@@ -80,7 +80,7 @@ class Loop:
         self.ticker.sent()
         self.ticker.start(robot.loop.period_s)
         self.log({"event": "start", "mono_ns": began_ns, "commanded_bar": bar})
-        targets, step = ahead(self.desired), -1
+        targets, step = next_reference(self.desired), -1
         warm_up = self.warm_up
 
         def prepare(left_s: float) -> float:
@@ -115,7 +115,7 @@ class Loop:
                     guard.on_time()
                 else:
                     sequence = None  # the acknowledgement of the step before is not this one's
-                    self.valves.beat(step + 1)
+                    self.valves.publish_tick(step + 1)
                     guard.missed(1)
             finally:  # the step that ended a run is the one that everybody wants to see
                 outcome["step_ms"] = (self.ticker.now() - tick.start_s) * 1e3
@@ -172,7 +172,7 @@ class Loop:
         }
 
 
-def _begun(tick: Tick, wall: datetime, frame: Frame | None, judged: Judgement) -> dict[str, Any]:
+def _begun(tick: Tick, wall: datetime, frame: TrackerFrame | None, judged: FrameCheck) -> dict[str, Any]:
     """The first part of a tick's line of the log: when it began, and with which frame."""
     seen = None
     if frame is not None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from modsoft.runtime.control.features import REST_LIMIT_DEG, angle_between_deg, from_poses
 from modsoft.runtime.errors import LostInRun, ModelError, ModsoftError, Tripped
 from modsoft.runtime.robot import Robot
-from modsoft.runtime.tracking.frame import Frame
+from modsoft.runtime.tracking.frame import TrackerFrame
 
 Array = NDArray[np.float64]
 
@@ -31,10 +31,10 @@ NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED = "no frame", "stale", "frozen", "ba
 WRONG_NUMBER, HIDDEN, NOT_FINITE, DISTORTED = "wrong number of tools", "tool hidden", "not finite", "distorted"
 SWAPPED, REVERSED, JUMP = "tools too far apart", "tools in a wrong order", "jump"
 GOOD = "good"
-GONE = (NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED)
+TRACKER_LOST = (NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED)
 
 
-class Judgement(NamedTuple):
+class FrameCheck(NamedTuple):
     """What a frame is good for: its configuration (N, 3) if `word` is "good", else None."""
 
     word: str
@@ -47,7 +47,7 @@ class Judgement(NamedTuple):
         return self.word == GOOD
 
 
-class FrameJudge:
+class FrameValidator:
     """Judges the newest frame at every tick; remembers the last good one.
 
     The gate on jumps: over the whole range of the actuation a module bends through half a turn at most, twice that for
@@ -57,27 +57,27 @@ class FrameJudge:
     def __init__(self, robot: Robot):
         self.robot = robot
         self._deg_per_s = 180.0 * robot.limits.largest_actuation_step / robot.loop.period_s
-        self._used: Frame | None = None
+        self._used: TrackerFrame | None = None
         self._used_configuration: Array | None = None
         self._rest_mm: list[float] | None = None
         self._offsets: deque[tuple[float, float]] = deque()  # (host's time, host's time - device's time)
 
-    def judge(self, frame: Frame | None, now_s: float) -> Judgement:
+    def judge(self, frame: TrackerFrame | None, now_s: float) -> FrameCheck:
         """Judges the newest frame at `now_s`, seconds of the monotonic clock."""
         if frame is None:
-            return Judgement(NO_FRAME)
+            return FrameCheck(NO_FRAME)
         age_s = now_s - frame.monotonic_s
         word, detail, configuration = self._order(frame, age_s)
         if word == GOOD:
             word, detail, configuration = self.content(frame)
         if word != GOOD:
-            return Judgement(word, None, age_s, detail)
+            return FrameCheck(word, None, age_s, detail)
         if self._rest_mm is None:
             self._rest_mm = _lengths_mm(frame)
         self._used, self._used_configuration = frame, configuration
-        return Judgement(GOOD, configuration, age_s)
+        return FrameCheck(GOOD, configuration, age_s)
 
-    def _order(self, frame: Frame, age_s: float) -> tuple[str, str, None]:
+    def _order(self, frame: TrackerFrame, age_s: float) -> tuple[str, str, None]:
         """Whether the frame is of this period: by the device's number first, then by age and by delay."""
         delay_s = self._delay_s(frame)
         limit_s = self.robot.limits.tracker_age_s
@@ -91,7 +91,7 @@ class FrameJudge:
             return DELAYED, f"{age_s + delay_s:.2f} s old by the device's count, at most {limit_s:g} s", None
         return GOOD, "", None
 
-    def _delay_s(self, frame: Frame) -> float:
+    def _delay_s(self, frame: TrackerFrame) -> float:
         """How much later this frame came than the promptest one of the last minute, by the device's count."""
         if frame.device_hz is None:
             return 0.0
@@ -103,7 +103,7 @@ class FrameJudge:
                 self._offsets.popleft()
         return max(0.0, offset_s - promptest_s)
 
-    def content(self, frame: Frame) -> tuple[str, str, Array | None]:
+    def content(self, frame: TrackerFrame) -> tuple[str, str, Array | None]:
         """What is wrong with the poses, in a word and in detail, else the configuration (N, 3). Remembers nothing."""
         count = self.robot.modules + 1
         if frame.poses.shape != (count, 4, 4) or len(frame.valid) != count:
@@ -138,7 +138,7 @@ class FrameJudge:
         return GOOD, "", configuration
 
 
-class Guard:
+class FaultCounter:
     """Counts what is waited out, and raises when it has gone on for too long."""
 
     def __init__(self, robot: Robot):
@@ -146,14 +146,14 @@ class Guard:
         self.bad_frames = 0  # in a row
         self.missed_ticks = 0  # in a row
 
-    def frame(self, judged: Judgement) -> None:
+    def frame(self, judged: FrameCheck) -> None:
         """Raises `LostInRun` or `Tripped` at the last frame in a row that the robot file allows to be bad."""
         if judged.good:
             self.bad_frames = 0
             return
         self.bad_frames += 1
         if self.bad_frames >= self._invalid_frames:
-            kind: type[ModsoftError] = LostInRun if judged.word in GONE else Tripped
+            kind: type[ModsoftError] = LostInRun if judged.word in TRACKER_LOST else Tripped
             detail = f" ({judged.detail})" if judged.detail else ""
             raise kind(
                 f"tracker: {self.bad_frames} ticks in a row without a good frame, the last one {judged.word}{detail}; "
@@ -218,6 +218,6 @@ def _ahead_mm(poses: Array) -> list[float]:
     ]
 
 
-def _lengths_mm(frame: Frame) -> list[float]:
+def _lengths_mm(frame: TrackerFrame) -> list[float]:
     """Distances from each tool to the next, mm: N."""
     return [math.dist(*pair) for pair in pairwise(frame.poses[:, :3, 3].tolist())]

@@ -44,11 +44,11 @@ from modsoft.runtime.errors import (
 from modsoft.runtime.files import read_text
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.robot import Robot
-from modsoft.runtime.safety import FrameJudge, check_rest
-from modsoft.runtime.statistics import Tally
+from modsoft.runtime.safety import FrameValidator, check_rest
+from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.status_line import StatusLine
 from modsoft.runtime.stop import Keys, Signals, Stop, StopKey
-from modsoft.runtime.tracking.frame import Reader, Slot, open_source, port_of
+from modsoft.runtime.tracking.frame import LatestFrame, Reader, open_source, port_of
 from modsoft.runtime.warmup import WarmUp
 
 Array = NDArray[np.float64]
@@ -101,10 +101,10 @@ def run(options: Options) -> None:
 
     with ExitStack() as exits:
         signals = exits.enter_context(Signals(stop, leave))
-        slot = Slot()
+        slot = LatestFrame()
         reader = Reader(open_source(robot, options.tracker_port or port_of(robot, beside), tools), slot)
         exits.callback(reader.close)
-        rest = _rest(slot, FrameJudge(robot), stop)
+        rest = _rest(slot, FrameValidator(robot), stop)
         controller.warm_up(robot.modules)
         _say(f"robot {robot.name}, {robot.modules} modules, hangs at {_angles(rest)} degrees")
         _say(f"model {options.model}, task {task}: {len(desired)} steps, {len(desired) * robot.loop.period_s:.0f} s")
@@ -117,7 +117,7 @@ def run(options: Options) -> None:
         _say(f"ready {time.perf_counter() - said:.1f} s after the start")
         if board is not None and not options.yes:
             _ask()
-        tally = Tally(robot, len(desired))
+        tally = TickStatistics(robot, len(desired))
         signals.hold()  # from here on there is a log to be closed
         log = logs.RunLog(
             options.runs,
@@ -139,7 +139,7 @@ def run(options: Options) -> None:
             exits.enter_context(keys)
             if board is not None:
                 board.arm(robot)
-            judge = FrameJudge(robot)  # a new one: Enter may have been long in coming
+            judge = FrameValidator(robot)  # a new one: Enter may have been long in coming
             rest = _rest(slot, judge, stop, missing=LostInRun)
             with StatusLine(lambda: _status(tally, log), sys.stderr):
                 Loop(
@@ -161,7 +161,9 @@ def run(options: Options) -> None:
         finish(board, log, tally, slot, error)
 
 
-def finish(board: Board | None, log: logs.RunLog, tally: Tally, slot: Slot, error: BaseException | None) -> None:
+def finish(
+    board: Board | None, log: logs.RunLog, tally: TickStatistics, slot: LatestFrame, error: BaseException | None
+) -> None:
     """Vents, closes the log, says what came of the run, and raises what ended it, if anything did."""
     began_ns, vented_ns = time.monotonic_ns(), None
     vented, pressed = False, dict[int, float]()
@@ -169,7 +171,7 @@ def finish(board: Board | None, log: logs.RunLog, tally: Tally, slot: Slot, erro
         try:
             vented = board.vent(VentMode.DUMP if isinstance(error, StopKey) else VentMode.RAMP)
             vented_ns = time.monotonic_ns() if vented else None
-            pressed = board.still_pressed() if vented else {}
+            pressed = board.residual_pressures_bar() if vented else {}
         except Exception as failed:  # noqa: BLE001 - the log must still be closed; the board's own timer vents
             error = error or failed
         if not vented and error is None:
@@ -265,8 +267,8 @@ def _task(task: str, robot: Robot) -> Array:
 
 
 def _rest(
-    slot: Slot,
-    judge: FrameJudge,
+    slot: LatestFrame,
+    judge: FrameValidator,
     stop: Stop,
     now: Callable[[], float] = time.monotonic,
     missing: type[ModsoftError] = DeviceAbsent,
@@ -303,7 +305,7 @@ def _ask() -> None:
         raise UsageError("arming asks for Enter, and there is nobody to press it; give --yes")
 
 
-def _status(tally: Tally, log: logs.RunLog) -> str:
+def _status(tally: TickStatistics, log: logs.RunLog) -> str:
     return tally.status + (f"  LOG: {log.trouble}" if log.trouble else "")
 
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from modsoft.runtime.clock import Tick
 from modsoft.runtime.control.features import bending_error_deg
 from modsoft.runtime.robot import Robot
-from modsoft.runtime.safety import Judgement
+from modsoft.runtime.safety import FrameCheck
 
 Array = NDArray[np.float64]
 
 
-class Tally:
+class TickStatistics:
     """Collects while the loop runs; `status` is always the newest status line."""
 
     def __init__(self, robot: Robot, steps: int):
@@ -35,7 +35,7 @@ class Tally:
         """Time to the acknowledgement of one step's set-points, None where it never came."""
         self.acknowledged_ms.append(ms)
 
-    def add(self, line: dict[str, Any], tick: Tick, judged: Judgement) -> None:
+    def add(self, line: dict[str, Any], tick: Tick, judged: FrameCheck) -> None:
         """One finished step, as it was logged."""
         self.late_ms.append(line["late_ms"])
         self.missed += tick.missed + (not line["sent"])
@@ -46,7 +46,7 @@ class Tally:
         self.status = self._status_line(line, tick, judged)
         self._before_s = tick.start_s
 
-    def _status_line(self, line: dict[str, Any], tick: Tick, judged: Judgement) -> str:
+    def _status_line(self, line: dict[str, Any], tick: Tick, judged: FrameCheck) -> str:
         rate = "" if self._before_s is None else f"{1.0 / (tick.start_s - self._before_s):.2f} Hz  "
         seen = "no frame"
         if line["frame"] is not None and judged.age_s is not None:

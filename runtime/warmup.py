@@ -19,8 +19,8 @@ from modsoft.runtime.clock import SPIN_S
 from modsoft.runtime.control.actuation import channel_pressures_bar, limited
 from modsoft.runtime.control.features import Window, state_of
 from modsoft.runtime.robot import Robot
-from modsoft.runtime.safety import FrameJudge, check_actuation
-from modsoft.runtime.tracking.frame import Frame
+from modsoft.runtime.safety import FrameValidator, check_actuation
+from modsoft.runtime.tracking.frame import TrackerFrame
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class WarmUp:
         self,
         robot: Robot,
         actuate: Callable[[Array], Array],
-        judge: FrameJudge,
+        judge: FrameValidator,
         log: Callable[[dict[str, Any]], None],
         now: Callable[[], float] = time.monotonic,
     ):
@@ -56,7 +56,7 @@ class WarmUp:
         self._fastest_step_s = min(self._fastest_step_s, seconds)
         self._runs = 0
 
-    def before(self, left_s: float, frame: Frame | None, window: Window, applied: Array) -> float:
+    def before(self, left_s: float, frame: TrackerFrame | None, window: Window, applied: Array) -> float:
         """Runs if it is time. Returns how long to wait of the `left_s` seconds until the step is due: 0 after a run.
 
         frame: the newest; applied (N, A): the actuation in force."""
@@ -81,7 +81,7 @@ class WarmUp:
         self._runs += 1
         return 0.0
 
-    def _run(self, frame: Frame, window: Window, applied: Array) -> None:
+    def _run(self, frame: TrackerFrame, window: Window, applied: Array) -> None:
         configuration = self._judge.content(frame)[2]
         if configuration is None:
             return

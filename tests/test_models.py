@@ -10,7 +10,7 @@ from modsoft.runtime.control import tasks
 from modsoft.runtime.control.model import Model
 from modsoft.training.simulation import fleet_kernel, rollout
 from modsoft.training.simulation.fleet import Fleet
-from modsoft.training.simulation.rollout import Pilot
+from modsoft.training.simulation.rollout import ControllerSetup
 
 pytestmark = pytest.mark.instructions
 
@@ -41,8 +41,8 @@ def test_a_shipped_model_drives_its_robot(file, robot, task, most):
     robot = robots.load(robot)
     controller = Model.load(MODELS / f"{file}.onnx")
     desired = tasks.task(task, robot.robot.kind, robot.modules)[:60]
-    pilot = Pilot(controller.actuate, controller.history, desired)
-    (flight,) = rollout.fly(robot, Fleet(robot.robot.kind, robot.modules, 1), [pilot])
+    pilot = ControllerSetup(controller.actuate, controller.history, desired)
+    (flight,) = rollout.rollout(robot, Fleet(robot.robot.kind, robot.modules, 1), [pilot])
     errors = rollout.angle_errors_deg if robot.robot.kind == "pneumatic" else rollout.configuration_errors_percent
     assert errors(flight.configuration, desired).mean(axis=0).max() < most
     still = np.broadcast_to(flight.configuration[:1], (61, robot.modules, 3))

@@ -79,7 +79,7 @@ def _factors(matrix: torch.Tensor) -> torch.Tensor:
     return matrix.reshape(GATES, rows // GATES, columns) if columns > rows // GATES else matrix
 
 
-class Optimiser:
+class MuonAndAdam:
     """Both as one. `rate` is Adam's; Muon's follows it."""
 
     def __init__(self, network: torch.nn.Module):

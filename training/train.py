@@ -141,7 +141,7 @@ def fastest_precision() -> str:
     return "bfloat16" if units.get("amx_bf16") and bfloat16_works("cpu") else "float32"
 
 
-def loss_of(estimated: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
+def charbonnier_loss(estimated: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
     """Mean of |estimated - true|, which is what the paper reports, rounded at zero so that it ends smoothly."""
     return (((estimated - true) ** 2 + (ROUND_PERCENT * ACTUATION_RANGE / 100.0) ** 2).sqrt()).mean()
 
@@ -299,7 +299,7 @@ def _fit(
     features, targets = (torch.from_numpy(each).to(device) for each in (training.features, training.targets))
     looked_at = validation.evenly(VALIDATED)
     network.to(device)
-    optimiser = optimizer.Optimiser(network)
+    optimiser = optimizer.MuonAndAdam(network)
     state: dict[str, Any] = {"identity": identity, "iteration": 0, "elapsed_s": 0.0}
     state |= {"best": None, "best_percent": math.inf, "worse": 0}
     if resume.is_file():
@@ -326,7 +326,7 @@ def _fit(
         network.train()
         with torch.autocast(device, torch.bfloat16, enabled=settings.precision == "bfloat16"):
             estimated = network(last_modules(features[rows], modules))
-        loss = loss_of(estimated.float(), targets[rows, -modules:])
+        loss = charbonnier_loss(estimated.float(), targets[rows, -modules:])
         loss.backward()
         # The first steps at a high rate now and then meet a gradient a hundred times the usual one.
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)

@@ -11,8 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modsoft.runtime.board.configuration_check import check_board
-from modsoft.runtime.board.connection import HELLO_WAIT_S, RESETS, STATUS_SILENCE_S, Link, Phase, fault_names, refusal
-from modsoft.runtime.board.io_thread import Line
+from modsoft.runtime.board.connection import (
+    HELLO_WAIT_S,
+    RESETS,
+    STATUS_SILENCE_S,
+    Connection,
+    Phase,
+    fault_names,
+    refusal,
+)
+from modsoft.runtime.board.io_thread import IoThread
 from modsoft.runtime.board.ports import Port, may_be_mega, open_port
 from modsoft.runtime.board.protocol import (
     CHANNELS,
@@ -62,8 +70,8 @@ class Board:
     ) -> None:
         self.name = name
         self._clock = clock
-        self._link = Link(clock(), resettable)
-        self._line = Line(port, self._link, clock, threaded)
+        self._link = Connection(clock(), resettable)
+        self._line = IoThread(port, self._link, clock, threaded)
         self._p_max = 0
         self._listened = False
         try:
@@ -191,9 +199,9 @@ class Board:
         if any(not 0 <= value <= self._p_max for value in units):
             raise Tripped(f"set-points {values} bar leave the range from 0 to {to_bar(self._p_max):g} bar")
         padded = tuple(units) + (0,) * (CHANNELS - len(units))
-        return self._line.hand_over(lambda: self._link.set(Set(tick & 0xFFFFFFFF, padded)))
+        return self._line.send_and_wait(lambda: self._link.set(Set(tick & 0xFFFFFFFF, padded)))
 
-    def beat(self, tick: int) -> None:
+    def publish_tick(self, tick: int) -> None:
         """Publish the control loop's counter on a tick that sends no set-points."""
         with self._line.changed:
             self._link.tick = tick & 0xFFFFFFFF
@@ -209,18 +217,18 @@ class Board:
                 self._link.vent(mode)
                 self._line.wake()
         if self._link.phase is Phase.READY:
-            self._line.wait(lambda: self._said_vented(since), self._clock() + timeout_s)
+            self._line.wait(lambda: self._reported_vented(since), self._clock() + timeout_s)
         if self._link.phase is Phase.LOST:
             since = self._link.lost_at  # whatever it said from then on still holds: nobody told it to open a valve
             if not self._listened:
                 self._listened = True  # once: nothing more will come after that
-                self._line.wait(lambda: self._said_vented(since), self._clock() + LOST_VENT_WAIT_S)
-        return self._said_vented(since)
+                self._line.wait(lambda: self._reported_vented(since), self._clock() + LOST_VENT_WAIT_S)
+        return self._reported_vented(since)
 
-    def _said_vented(self, since: float) -> bool:
+    def _reported_vented(self, since: float) -> bool:
         return self._link.vented and self._link.status_at >= since and not self._link.busy
 
-    def still_pressed(self) -> dict[int, float]:
+    def residual_pressures_bar(self) -> dict[int, float]:
         """Channels whose sensor still measures pressure about a second after the venting, with that pressure, bar.
 
         Returns as soon as there is none; also where the board's word is too old to tell.

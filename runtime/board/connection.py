@@ -19,7 +19,6 @@ from modsoft.runtime.board.protocol import (
     ClearFault,
     Fault,
     ForeignHello,
-    Frame,
     Heartbeat,
     Hello,
     HelloReq,
@@ -33,6 +32,7 @@ from modsoft.runtime.board.protocol import (
     Status,
     Vent,
     VentMode,
+    WireFrame,
     encode,
     message_id,
 )
@@ -68,7 +68,7 @@ class _Request:
         self.due = 0.0  # at once
 
 
-class Link:
+class Connection:
     """One conversation with one board. Times are seconds of one monotonic clock, `now` never runs backwards.
 
     resettable: False where the device is known not to be a MEGA, and is not to be reset.
@@ -135,7 +135,7 @@ class Link:
         self.refused = None
         self._request = _Request(ClearFault(mask), RETRIES)
 
-    def hang_up(self, why: str, now: float) -> None:
+    def close(self, why: str, now: float) -> None:
         """The port failed, or the owner gives up."""
         self._lose(why, now)
 
@@ -195,7 +195,7 @@ class Link:
             cause = ResetCause(hello.reset_cause).name if hello.reset_cause in set(ResetCause) else "?"
             self._lose(f"the board restarted by itself (reset cause {cause})", now)
 
-    def _on_status(self, status: Status, frame: Frame, now: float) -> None:
+    def _on_status(self, status: Status, frame: WireFrame, now: float) -> None:
         self.status, self.status_at = status, now
         if self.phase is not Phase.READY or self.hello is None:
             return

@@ -28,5 +28,5 @@ class Rehearsal:
     def set_pressures(self, tick: int, pressures_bar: Array) -> int:
         return tick & 0xFF
 
-    def beat(self, tick: int) -> None:
+    def publish_tick(self, tick: int) -> None:
         """Nobody listens."""

@@ -1,4 +1,4 @@
-"""The serial line to the board: a thread that owns the port, and the lock that guards the `Link` which it serves.
+"""The serial line to the board: a thread that owns the port, and the lock that guards the `Connection` which it serves.
 
 The thread sends the heartbeats, but with the control loop's own counter in them, so that the board also notices a loop
 that is stuck while this thread lives.
@@ -10,21 +10,21 @@ import threading
 from collections.abc import Callable
 from typing import TypeVar
 
-from modsoft.runtime.board.connection import Link, Phase
+from modsoft.runtime.board.connection import Connection, Phase
 from modsoft.runtime.board.ports import READ_WAIT_S, Port
 
 HAND_OVER_S = 0.002  # ten times what it takes
 T = TypeVar("T")
 
 
-class Line:
+class IoThread:
     """What comes from the port goes to the link, what the link has to say goes out, until `close` or an error.
 
     `changed` is held by whoever asks something of the link, and notified when something came. clock: monotonic seconds.
     threaded: False serves the port from the calls that wait instead of a thread of its own, for tests on virtual time.
     """
 
-    def __init__(self, port: Port, link: Link, clock: Callable[[], float], threaded: bool) -> None:
+    def __init__(self, port: Port, link: Connection, clock: Callable[[], float], threaded: bool) -> None:
         self.changed = threading.Condition()
         self._port = port
         self._link = link
@@ -48,7 +48,7 @@ class Line:
         if self._thread is not None and not self.closed:
             self._port.cancel_read()
 
-    def hand_over(self, ask: Callable[[], T]) -> T:
+    def send_and_wait(self, ask: Callable[[], T]) -> T:
         """Returns what `ask`, which wants something of the link, returned: when that is written, or 2 ms later.
 
         The thread of the port needs the interpreter, so the caller steps aside for it, but a port that takes nothing
@@ -96,7 +96,7 @@ class Line:
                 self._set_dtr(self._link.dtr)
         except OSError as error:  # pyserial's own errors are OSErrors too
             with self.changed:
-                self._link.hang_up(f"the port failed ({error})", self._clock())
+                self._link.close(f"the port failed ({error})", self._clock())
             self._stop.set()
             return False
         return True
@@ -115,7 +115,7 @@ class Line:
         finally:
             with self.changed:
                 if not self._stop.is_set():  # a bug: nothing is sent any more, and the loop has to know
-                    self._link.hang_up("the thread of the port ended by an error", self._clock())
+                    self._link.close("the thread of the port ended by an error", self._clock())
                 self.changed.notify_all()
 
     def _set_dtr(self, level: bool) -> None:

@@ -214,7 +214,7 @@ CONSTANTS = (
 )
 
 
-class Frame(NamedTuple):
+class WireFrame(NamedTuple):
     """One decoded frame."""
 
     seq: int
@@ -297,7 +297,7 @@ def encode(message: Message, seq: int = 0, session: int = 0) -> bytes:
     return b"\0" + cobs_encode(body + zlib.crc32(body).to_bytes(CRC_LENGTH, "little")) + b"\0"
 
 
-def decode(encoded: bytes) -> Frame | ForeignHello:
+def decode(encoded: bytes) -> WireFrame | ForeignHello:
     """Return the message between two delimiters; `FrameError` says why there is none."""
     if len(encoded) > MAX_ENCODED:
         raise FrameError(f"frame of {len(encoded)} bytes, longer than {MAX_ENCODED}")
@@ -317,7 +317,7 @@ def decode(encoded: bytes) -> Frame | ForeignHello:
         raise FrameError(f"{layout.table.__name__} of {len(payload)} bytes, not {layout.packer.size}")
     values = iter(layout.packer.unpack(payload))
     unpacked = [next(values) if count == 1 else tuple(next(values) for _ in range(count)) for count in layout.counts]
-    return Frame(body[1], body[2], layout.table(*unpacked))
+    return WireFrame(body[1], body[2], layout.table(*unpacked))
 
 
 class Parser:
@@ -328,7 +328,7 @@ class Parser:
         self._tail = b""
         self._overlong = False
 
-    def feed(self, data: bytes) -> list[Frame | ForeignHello]:
+    def feed(self, data: bytes) -> list[WireFrame | ForeignHello]:
         """Take the next bytes of the line, return the messages they complete."""
         messages = []
         *complete, self._tail = (self._tail + data).split(b"\0")

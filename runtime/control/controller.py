@@ -54,11 +54,11 @@ class Controller:
         self.window.observe(self._state)
         if measured is None:
             return self.applied
-        self.target = self._correction.aim(next_desired, desired, measured)
+        self.target = self._correction.shifted(next_desired, desired, measured)
         self.raw = self._policy.actuate(self.window.features(state_of(self.target, kind)))
         check_actuation(self.raw)
         actuation = limited(self.raw, self.applied, self._robot.limits.largest_actuation_step)
-        self._correction.answered(self.raw, actuation)
+        self._correction.record_output(self.raw, actuation)
         return actuation
 
     def record(self, actuation: Array) -> None:

@@ -22,18 +22,18 @@ Array = NDArray[np.float64]
 # swing at the edge of their workspace. With 0.5 degrees of noise 0.3 leaves less than 0.5 does.
 GAIN = 0.4
 LARGEST_SHIFT = 0.4  # of the unit vector
-LET_GO = 0.5  # of the sum, in each period in which a module cannot do more
+ANTI_WINDUP_DECAY = 0.5  # of the sum, in each period in which a module cannot do more
 
 
 class Correction(Protocol):
     """What stands between the task and the network for one run."""
 
-    def aim(self, ahead: Array, desired: Array, measured: Array) -> Array:
+    def shifted(self, ahead: Array, desired: Array, measured: Array) -> Array:
         """What the network is asked for, (N, 3) unit vectors: `ahead` is desired at the end of this period, `desired`
         was at its start, where the robot is `measured`, all (N, 3)."""
         ...
 
-    def answered(self, raw: Array, applied: Array) -> None:
+    def record_output(self, raw: Array, applied: Array) -> None:
         """The network's answer `raw` (N, A), and what is applied of it after every limit."""
         ...
 
@@ -41,10 +41,10 @@ class Correction(Protocol):
 class NoCorrection:
     """The network alone."""
 
-    def aim(self, ahead: Array, desired: Array, measured: Array) -> Array:
+    def shifted(self, ahead: Array, desired: Array, measured: Array) -> Array:
         return np.asarray(ahead)
 
-    def answered(self, raw: Array, applied: Array) -> None:
+    def record_output(self, raw: Array, applied: Array) -> None:
         pass
 
 
@@ -56,7 +56,7 @@ class IntegralCorrection:
         self.sum = np.zeros((modules, 3))
         self._held = np.zeros(modules, dtype=bool)  # modules whose last answer did not go out as it was
 
-    def aim(self, ahead: Array, desired: Array, measured: Array) -> Array:
+    def shifted(self, ahead: Array, desired: Array, measured: Array) -> Array:
         ahead = np.asarray(ahead)
         error = np.asarray(desired) - measured
         # Anti-windup at the unit sphere: what points out of it asks for nothing that a module can do, but would have
@@ -67,11 +67,11 @@ class IntegralCorrection:
         # Anti-windup at saturation: a module that cannot do more lets go of its sum. Beyond what can be reached the
         # network alone errs less than with a sum that was held from where it still could: a quarter less at the tip.
         grows = np.linalg.norm(summed, axis=-1) > np.linalg.norm(self.sum, axis=-1)
-        self.sum = np.where((self._held & grows)[:, None], (1.0 - LET_GO) * self.sum, summed)
+        self.sum = np.where((self._held & grows)[:, None], (1.0 - ANTI_WINDUP_DECAY) * self.sum, summed)
         shifted = ahead + self.sum
         return shifted / np.linalg.norm(shifted, axis=-1, keepdims=True)
 
-    def answered(self, raw: Array, applied: Array) -> None:
+    def record_output(self, raw: Array, applied: Array) -> None:
         self._held = np.any(raw != applied, axis=-1)
 
 

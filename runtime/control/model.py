@@ -65,14 +65,14 @@ class Unit:
         """`where` is named in the errors."""
         self.session = session
         self.where = where
-        self._check_border()
+        self._check_interface()
         self.feature_size: int = self.session.get_inputs()[0].shape[2]
         self.action_size: int = self.session.get_outputs()[0].shape[2]
         self.layers, _, self.hidden = self.session.get_overridable_initializers()[0].shape
         self.sizes = {"feature_size": self.feature_size, "action_size": self.action_size, "modules": None}
         self.sizes |= {"layers": self.layers, "hidden": self.hidden}
 
-    def _check_border(self) -> None:
+    def _check_interface(self) -> None:
         session = self.session
         inputs, states, outputs = session.get_inputs(), session.get_overridable_initializers(), session.get_outputs()
         names = ([i.name for i in inputs], sorted(i.name for i in states), [o.name for o in outputs])
@@ -111,7 +111,7 @@ class Unit:
         return actuation
 
 
-class BoundUnit:
+class FixedSizeUnit:
     """The graph of a network that is bound to its number of modules N (Table S1: LSTM, four LSTM), in onnxruntime."""
 
     def __init__(self, session: onnxruntime.InferenceSession, where: str = "model"):
@@ -135,17 +135,17 @@ class BoundUnit:
         return _actuation(self.session, features)
 
 
-def unit_of(model: bytes, where: str = "model") -> Unit | BoundUnit:
+def unit_of(model: bytes, where: str = "model") -> Unit | FixedSizeUnit:
     """A serialised ONNX model, ready to run: a unit where it takes neighbours' states, else one bound to its number of
     modules. `ModelError` for any other; `where` is named in it."""
     session = _opened(model, where)
-    return Unit(session, where) if session.get_overridable_initializers() else BoundUnit(session, where)
+    return Unit(session, where) if session.get_overridable_initializers() else FixedSizeUnit(session, where)
 
 
 class Model:
     """A model file, proven and ready to run. `description` says what it is, `history` is its T."""
 
-    def __init__(self, unit: Unit | BoundUnit, description: Description):
+    def __init__(self, unit: Unit | FixedSizeUnit, description: Description):
         self.unit = unit
         self.description = description
         self.where = unit.where

@@ -98,7 +98,7 @@ def describe(text: str, where: str) -> Description:
         raise ModelError(f"{where}: its description cannot be read ({error}); export it again") from error
 
 
-def sealed(model: bytes) -> bytes:
+def with_checksum(model: bytes) -> bytes:
     """The serialised model, whose description has `UNSEALED` for a seal, with its seal set. `ModelError` when the
     provenance, say, has another entry that looks like a seal."""
     found = list(_SEAL.finditer(model))

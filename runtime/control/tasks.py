@@ -60,7 +60,7 @@ def task_planar(largest_deg: list[float]) -> Array:
     return from_angles_deg(share[:, None] * np.asarray(largest_deg))
 
 
-def ahead(desired: Array) -> Array:
+def next_reference(desired: Array) -> Array:
     """What the network is asked for at each step (K, N, 3): S_d of eq. (1) is the state at the end of the period, which
     is desired at the start of the next. The last period ends where the task does."""
     return np.concatenate([desired[1:], desired[-1:]])

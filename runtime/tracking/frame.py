@@ -1,7 +1,7 @@
 """Frames of the optical tracker, the slot that holds the newest one, and the thread that fills it.
 
-A source is anything with `read() -> Frame | None` (None: nothing new), which may block, and `close()`. It is read and
-closed by one thread, since the clients of trackers cannot be used by two.
+A source is anything with `read() -> TrackerFrame | None` (None: nothing new), which may block, and `close()`.
+It is read and closed by one thread, since the clients of trackers cannot be used by two.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CLOSE_WAIT_S = 0.5  # a client that waits for a mute device is left behind
 
 
 @dataclass(frozen=True)
-class Frame:
+class TrackerFrame:
     """What the tracker saw at one instant: the base's tool and those at the module ends, in the tracker's own frame.
 
     device_frame: the device's number, which is what orders frames. monotonic_s: taken before the device was asked, so
@@ -42,11 +42,11 @@ class Frame:
 class Source(Protocol):
     """Where frames come from."""
 
-    def read(self) -> Frame | None: ...
+    def read(self) -> TrackerFrame | None: ...
     def close(self) -> None: ...
 
 
-class Slot:
+class LatestFrame:
     """Holds the newest frame by the device's count; what is not newer is dropped and counted.
 
     A repeated frame does not renew the age of the one that is held, so a frozen device goes stale.
@@ -54,11 +54,11 @@ class Slot:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._frame: Frame | None = None
+        self._frame: TrackerFrame | None = None
         self.counts: Counter[str] = Counter()  # received, repeated, backwards
         self.error: BaseException | None = None  # what ended the reading
 
-    def put(self, frame: Frame) -> None:
+    def put(self, frame: TrackerFrame) -> None:
         with self._lock:
             held = self._frame
             if held is None or frame.device_frame > held.device_frame:
@@ -67,7 +67,7 @@ class Slot:
             else:
                 self.counts["repeated" if frame.device_frame == held.device_frame else "backwards"] += 1
 
-    def latest(self) -> Frame | None:
+    def latest(self) -> TrackerFrame | None:
         with self._lock:
             return self._frame
 
@@ -76,7 +76,7 @@ class Reader:
     """Reads a source into a slot from a daemon thread, which also closes it. The source is opened by the caller, so
     that its errors are the caller's."""
 
-    def __init__(self, source: Source, slot: Slot):
+    def __init__(self, source: Source, slot: LatestFrame):
         self.slot = slot
         self._source = source
         self._stop = threading.Event()

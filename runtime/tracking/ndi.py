@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from modsoft.runtime.board.ports import ports_here
 from modsoft.runtime.errors import DeviceAbsent, UsageError
-from modsoft.runtime.tracking.frame import Frame
+from modsoft.runtime.tracking.frame import TrackerFrame
 
 # How fast each device counts its frames, whatever share of them is asked for (NDI's API guides).
 FRAME_HZ = {"polaris": 60.0, "vega": 60.0, "aurora": 40.0}
@@ -51,7 +51,7 @@ class NDI:
             self.close()
             raise DeviceAbsent(f"tracker at {port}: {found} tools, the robot needs {count}: base, then modules")
 
-    def read(self) -> Frame | None:
+    def read(self) -> TrackerFrame | None:
         """The next frame, at the pace at which the device makes them; None while it has no new one. Raises
         `DeviceAbsent` at the third error in a row."""
         left_s = self._due_s - self._now()
@@ -74,7 +74,7 @@ class NDI:
         self._newest = number
         stack = np.asarray(poses, dtype=np.float64)
         valid = np.asarray(np.isfinite(stack).all(axis=(1, 2)))
-        return Frame(number, asked_s, stack, valid, np.asarray(quality, dtype=np.float64), FRAME_HZ[self._kind])
+        return TrackerFrame(number, asked_s, stack, valid, np.asarray(quality, dtype=np.float64), FRAME_HZ[self._kind])
 
     def close(self) -> None:
         try:

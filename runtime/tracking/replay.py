@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from modsoft.runtime.errors import DeviceAbsent
 from modsoft.runtime.files import read_text
-from modsoft.runtime.tracking.frame import Frame
+from modsoft.runtime.tracking.frame import TrackerFrame
 
 LONGEST_GAP_NS = 3600 * 10**9  # between two frames of one run
 
@@ -57,7 +57,7 @@ class Replay:
         self._start_s = now()
         self._next = 0
 
-    def read(self) -> Frame | None:
+    def read(self) -> TrackerFrame | None:
         if self._next == len(self._frames):
             self._wait(0.05)
             return None
@@ -67,14 +67,14 @@ class Replay:
             self._wait(min(due_s - self._now(), 0.05))
             return None
         self._next += 1
-        return Frame(frame.device_frame, due_s, frame.poses, frame.valid, frame.quality)
+        return TrackerFrame(frame.device_frame, due_s, frame.poses, frame.valid, frame.quality)
 
     def close(self) -> None:
         self._frames = []
         self._next = 0
 
 
-def recorded(path: Path, tools: int) -> Iterator[Frame]:
+def recorded(path: Path, tools: int) -> Iterator[TrackerFrame]:
     """The frames of a run's log, each for `tools` tools; at least one. `DeviceAbsent` says which line is wrong."""
     if path.exists() and not path.is_file():
         raise DeviceAbsent(f"{path} is a device or pipe, expected the log of a run")
@@ -111,7 +111,7 @@ def _is_torn(line: str, is_last: bool) -> bool:
     return False
 
 
-def _frame(found: RecordedFrame, tools: int) -> Frame:
+def _frame(found: RecordedFrame, tools: int) -> TrackerFrame:
     """ValueError where its arrays do not fit `tools` tools."""
     for name in ("poses", "valid", "quality"):
         if (count := len(getattr(found, name))) != tools:
@@ -119,4 +119,4 @@ def _frame(found: RecordedFrame, tools: int) -> Frame:
     if any([len(pose), *map(len, pose)] != [4] * 5 for pose in found.poses):
         raise ValueError("poses that are not all 4 x 4")
     poses, quality = (np.array(rows, dtype=np.float64) for rows in (found.poses, found.quality))  # null becomes NaN
-    return Frame(found.number, found.mono_ns * 1e-9, poses, np.array(found.valid, dtype=bool), quality)
+    return TrackerFrame(found.number, found.mono_ns * 1e-9, poses, np.array(found.valid, dtype=bool), quality)

@@ -54,11 +54,11 @@ class NativeBoard:
             self.now_ms = (self.now_ms + 1) & 0xFFFFFFFF
             self.update()
 
-    def messages(self) -> list[protocol.Frame]:
+    def messages(self) -> list[protocol.WireFrame]:
         """What the board has sent since the last look."""
         frames = self.parser.feed(self.drain())
         assert self.parser.errors == 0
-        assert all(isinstance(frame, protocol.Frame) for frame in frames)
+        assert all(isinstance(frame, protocol.WireFrame) for frame in frames)
         return frames  # type: ignore[return-value]
 
     # ---- what a host does

@@ -369,7 +369,7 @@ def test_loop_that_holds_keeps_the_board_running(rig):
     tick = run(board, port, 1)
     for _ in range(10):
         tick += 1
-        board.beat(tick)
+        board.publish_tick(tick)
         run_pumps(board, 80)
     assert port.board.state == State.RUNNING
 
@@ -492,7 +492,7 @@ def test_a_valve_that_stays_open_is_seen_by_its_sensor(rig):
     port.board.measured[1:6] = [0] * 5
     assert board.vent()
     began_ms = port.now_ms
-    assert board.still_pressed() == pytest.approx({0: 0.2})
+    assert board.residual_pressures_bar() == pytest.approx({0: 0.2})
     assert 950 <= port.now_ms - began_ms <= 1100
 
 
@@ -502,7 +502,7 @@ def test_a_robot_that_empties_is_waited_for_no_longer_than_needed(rig):
     run(board, port, 2)
     assert board.vent()
     began_ms = port.now_ms
-    assert board.still_pressed() == {}
+    assert board.residual_pressures_bar() == {}
     assert port.now_ms - began_ms <= 100
 
 

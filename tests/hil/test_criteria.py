@@ -20,7 +20,7 @@ def flawless():
 
 
 def broken(verdict):
-    return [line.name for line in verdict.acceptances if not line.ok]
+    return [line.name for line in verdict.criteria if not line.ok]
 
 
 def test_a_flawless_run_passes(flawless):
@@ -146,7 +146,7 @@ def test_each_flaw_breaks_its_own_line(flawless, name):
 def test_no_line_goes_without_a_flaw(flawless):
     tracking = {f"tracking error of module {module}, mean" for module in (1, 2, 3)}  # see below
     wild = {line for _, lines in WILD.values() for line in lines}
-    assert {line.name for line in judge(flawless).acceptances} == {*FLAWS, OFF_THE_LOG, *wild, *tracking}
+    assert {line.name for line in judge(flawless).criteria} == {*FLAWS, OFF_THE_LOG, *wild, *tracking}
 
 
 @pytest.mark.parametrize("name", WILD)

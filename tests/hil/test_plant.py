@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from modsoft.hil.plant import Plant, duties_from, run, set_points_bar, tool_poses
+from modsoft.hil.plant import ValvesAndArm, duties_from, run, set_points_bar, tool_poses
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control.actuation import channel_pressures_bar, pressures_bar
 from modsoft.runtime.control.features import from_directors, from_poses
@@ -93,7 +93,7 @@ def test_slices_keep_to_absolute_deadlines_and_catch_up(robot):
             time.now_ns += 70_000_000 if k == 3 else 5_000_000  # slice 3 takes 70 ms, the others 5
             yield None
 
-    run(Plant(robot, arm), duties(), lines.append, time.clock_ns, time.sleep, slice_s=0.02)
+    run(ValvesAndArm(robot, arm), duties(), lines.append, time.clock_ns, time.sleep, slice_s=0.02)
     states = [line for line in lines if line["event"] == "state"]
     assert lines[0] == {"event": "ready"}
     assert [s["mono_ns"] - start for s in states] == [20_000_000 * (k + 1) for k in range(10)]
@@ -108,7 +108,7 @@ def test_slices_keep_to_absolute_deadlines_and_catch_up(robot):
 def test_duties_are_held_until_new_ones_come(robot):
     lines, arm, time = [], StandIn(3), Time()
     full = np.full(12, 0.1)
-    run(Plant(robot, arm), iter([None, full, None]), lines.append, time.clock_ns, time.sleep)
+    run(ValvesAndArm(robot, arm), iter([None, full, None]), lines.append, time.clock_ns, time.sleep)
     pressures = [np.max(line["pressure_bar"]) for line in lines if line["event"] == "state"]
     assert pressures == pytest.approx([0.0, 0.3, 0.3])
     assert lines[2]["channel_bar"] == pytest.approx({chamber.channel: 0.3 for chamber in robot.chambers})
@@ -132,6 +132,6 @@ def test_the_newest_duties_of_the_pipe_win_and_its_end_ends():
 
 def test_every_line_is_json(robot):
     lines = []
-    stepped = Plant(robot, StandIn(3))
+    stepped = ValvesAndArm(robot, StandIn(3))
     run(stepped, iter([np.full(12, 0.1)]), lambda line: lines.append(json.dumps(line)), sleep=lambda seconds: None)
     assert [json.loads(line)["event"] for line in lines] == ["ready", "state", "summary"]

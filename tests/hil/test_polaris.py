@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modsoft.hil.polaris import Line, write_tool_files
+from modsoft.hil.polaris import Pty, write_tool_files
 from modsoft.hil.polaris_device import Polaris, crc16, quaternion
 from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.tracking.ndi import NDI
@@ -206,7 +206,7 @@ def test_quaternion_gives_the_rotation_back(values):
 def test_a_file_in_the_place_of_the_port_stays(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(UsageError, match="file: exists and is no link"):
-        Line(tmp_path / "file")
+        Pty(tmp_path / "file")
     assert (tmp_path / "file").read_text() == "mine"
 
 

@@ -85,11 +85,11 @@ def as_in_collection(found, run_folder):
 def test_a_model_of_three_modules_runs_robots_of_three_and_two(robot, strong_model, tmp_path):
     found = run(tmp_path, robot, strong_model, steps=20)
     verdict = criteria.judge(found)
-    table = "\n".join(f"{line.ok}  {line.name}: {line.found} ({line.limit})" for line in verdict.acceptances)
+    table = "\n".join(f"{line.ok}  {line.name}: {line.found} ({line.limit})" for line in verdict.criteria)
     print(table)
     assert verdict.word == "not judged", table
     if "too slow" not in verdict.reason:
-        assert all(line.ok for line in verdict.acceptances), table
+        assert all(line.ok for line in verdict.criteria), table
         off = angle_between_deg(found.configuration, as_in_collection(found, next(tmp_path.glob("runtime-log-*/*"))))
         print(f"off the robot of the training data, same actuation: mean {off.mean():.3f}, max {off.max():.2f}°")
         assert off.mean() < 0.3, "the rig's robot is not the one that the controller was trained on"

@@ -238,7 +238,7 @@ def test_row_29_sensors(matrix_row, full):
                 assert rises(emulated.trace, since) == 0
                 dumped_ms = vented_ms(emulated, since, event["t_us"])
                 times_ms.append(dumped_ms if fault is Fault.OVER_PRESSURE else (began_us - event["t_us"]) / 1000)
-                assert host.board.still_pressed() == {}
+                assert host.board.residual_pressures_bar() == {}
                 assert host.board.clear_fault()
                 host.start()
         return times_ms

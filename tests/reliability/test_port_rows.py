@@ -279,7 +279,7 @@ def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypat
 
 def given_up_when_mute():
     """Seconds after which a port without a byte is given up, and how many resets were tried before."""
-    silent, hundredths = connection.Link(0.0), 0
+    silent, hundredths = connection.Connection(0.0), 0
     while not silent.gave_up:
         hundredths += 1
         assert silent.poll(hundredths / 100) == b""

@@ -11,8 +11,8 @@ from modsoft.runtime import robot as robots
 from modsoft.runtime import safety
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.errors import LostInRun, Tripped
-from modsoft.runtime.safety import FrameJudge
-from modsoft.runtime.tracking.frame import Frame, Slot
+from modsoft.runtime.safety import FrameValidator
+from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 
 VENT_LIMIT_S = 3 * PERIOD_S + 0.05  # from the last good frame on
 RUN_S = 8 * PERIOD_S  # of a run before its fault
@@ -135,13 +135,13 @@ def noise(rng, now_s, drift):
     poses = planar_poses(angles)
     poses[:, :3, 3] += rng.normal(0, 0.5, (4, 3))
     number = int((now_s - age_s - rng.uniform(0, 0.017)) * 60 * (1 + drift))
-    return Frame(number, now_s - age_s, poses, np.ones(4, bool), np.full(4, 0.1), 60.0)
+    return TrackerFrame(number, now_s - age_s, poses, np.ones(4, bool), np.full(4, 0.1), 60.0)
 
 
 def test_row_15_delayed(matrix_row, full):
     """Frames that are late on the line, which the host sees, or in the device, which only its count tells."""
     rng, tries, used, worst_s = np.random.default_rng(15), 1_000_000 if full else 20_000, 0, 0.0
-    judge, now_s, seen_s = FrameJudge(ROBOT), 1000.0, 0.0
+    judge, now_s, seen_s = FrameValidator(ROBOT), 1000.0, 0.0
     for step in range(tries):
         now_s += PERIOD_S
         late = rng.choice(["no", "line", "device", "both"], p=[0.4, 0.2, 0.2, 0.2]) if step >= 10 else "no"
@@ -150,7 +150,9 @@ def test_row_15_delayed(matrix_row, full):
         number = int((now_s - on_line_s - in_device_s) * 60)
         in_device_s = now_s - on_line_s - number / 60 if in_device_s else 0.0
         on_line_s = now_s - number / 60 - in_device_s
-        frame = Frame(number, now_s - on_line_s, planar_poses((1.0, 2.0, 3.0)), np.ones(4, bool), np.full(4, 0.1), 60.0)
+        frame = TrackerFrame(
+            number, now_s - on_line_s, planar_poses((1.0, 2.0, 3.0)), np.ones(4, bool), np.full(4, 0.1), 60.0
+        )
         if judge.judge(frame, now_s).good:
             assert number / 60 > seen_s, "an older frame after a newer one"
             used, seen_s = used + 1, number / 60
@@ -282,13 +284,13 @@ def test_row_18_hidden_wrong_number_swapped(matrix_row, full):
 
 def test_row_19_numbers_backwards(matrix_row, full):
     rng, tries, used, dropped = np.random.default_rng(19), 1_000_000 if full else 20_000, 0, 0
-    slot, judge = Slot(), FrameJudge(ROBOT)
+    slot, judge = LatestFrame(), FrameValidator(ROBOT)
     good, newest, last, now_s = planar_poses((1.0, 2.0, 3.0)), -1, -1, 1000.0
     for step in range(tries):
         now_s += 1 / 60
         back = rng.choice([0, rng.integers(1, 100), rng.integers(100, 60_000)], p=[0.5, 0.3, 0.2])
         number = int(now_s * 60) - back
-        frame = Frame(number, now_s, good, np.ones(4, bool), np.full(4, 0.1), 60.0)
+        frame = TrackerFrame(number, now_s, good, np.ones(4, bool), np.full(4, 0.1), 60.0)
         slot.put(frame)
         dropped += number <= newest
         newest = max(newest, number)

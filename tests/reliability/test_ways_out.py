@@ -221,7 +221,7 @@ def test_row_11_the_fault_stays_latched_for_a_host_that_comes_back(fault, error,
             since = len(emulated.trace)
             with pytest.raises(error):
                 host.go_on(1.0)
-            host.board.beat(host.tick + 100)
+            host.board.publish_tick(host.tick + 100)
             beat_for(host, 1.0)
             assert (host.board.status.state, host.board.status.faults) == (State.FAULT, fault)
             assert rises(emulated.trace, since) == 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from modsoft.runtime.board.connection import HEARTBEAT_S, Link, Phase
+from modsoft.runtime.board.connection import HEARTBEAT_S, Connection, Phase
 from modsoft.runtime.board.protocol import CHANNELS, PROTOCOL_HASH, Hello, HelloReq, Set, State, Status, encode
 
 HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 30000, 20000, 300, 1000)
@@ -13,7 +13,7 @@ IDLE = Status(0, State.IDLE, 0, 7, 1, 0, ZERO, ZERO, 0, 0, 0, 5000)
 
 
 def ready():
-    link = Link(0.0)
+    link = Connection(0.0)
     link.feed(encode(HELLO), 0.1)
     assert link.phase is Phase.READY
     return link
@@ -41,7 +41,7 @@ def test_an_acknowledgement_is_of_this_session():
 
 
 def test_what_was_said_before_the_announcement_is_forgotten():
-    link = Link(0.0)
+    link = Connection(0.0)
     link.feed(encode(IDLE), 0.05)
     assert link.status is not None
     link.feed(encode(HELLO), 0.1)
@@ -71,7 +71,7 @@ def test_another_session_is_not_the_one_asked_for():
 
 
 def test_what_talks_another_language_is_given_up_without_a_reset():
-    link = Link(0.0)
+    link = Connection(0.0)
     for tenth in range(1, 25):
         link.feed(b"ready > ", 0.1 * tenth)
         assert link.poll(0.1 * tenth) == b""
@@ -83,7 +83,7 @@ def test_what_talks_another_language_is_given_up_without_a_reset():
 
 def test_what_came_before_the_firmware_could_run_says_nothing():
     """Half a frame from before the reset, then silence: our board, whose announcement was lost."""
-    link = Link(0.0)
+    link = Connection(0.0)
     link.feed(encode(IDLE)[20:], 0.01)
     link.poll(2.5)
     assert link.phase is Phase.WAITING
@@ -92,7 +92,7 @@ def test_what_came_before_the_firmware_could_run_says_nothing():
 
 
 def test_an_announcement_that_is_just_coming_in_is_waited_for():
-    link = Link(0.0)
+    link = Connection(0.0)
     announcement = encode(HELLO)
     link.feed(announcement[:9], 2.49)
     link.poll(2.5)
@@ -102,7 +102,7 @@ def test_an_announcement_that_is_just_coming_in_is_waited_for():
 
 
 def test_a_board_that_was_running_is_ours_whatever_else_came():
-    link = Link(0.0)
+    link = Connection(0.0)
     link.feed(b"noise", 1.6)
     link.feed(encode(IDLE), 1.7)
     link.poll(2.5)
@@ -110,12 +110,12 @@ def test_a_board_that_was_running_is_ours_whatever_else_came():
 
 
 def test_a_device_that_is_no_mega_is_never_reset():
-    link = Link(0.0, resettable=False)
+    link = Connection(0.0, resettable=False)
     assert link.poll(2.4) == b""
     assert link.phase is Phase.WAITING
     link.poll(2.5)
     assert (link.phase, link.gave_up, link.resets, link.dtr) == (Phase.LOST, True, 0, True)
-    talking = Link(0.0, resettable=False)
+    talking = Connection(0.0, resettable=False)
     talking.feed(encode(IDLE), 2.4)
     assert talking.poll(2.5) == encode(HelloReq(PROTOCOL_HASH))
     talking.poll(3.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from modsoft.runtime.control.correction import IntegralCorrection, NoCorrection, named
-from modsoft.runtime.control.tasks import ahead, task
+from modsoft.runtime.control.tasks import next_reference, task
 from modsoft.runtime.errors import UsageError
 
 
@@ -14,13 +14,13 @@ def unit(vectors):
 
 def driven(correction, desired, off, reach=lambda aim: aim):
     """Distance (K, N), percent, of a robot that lands `off` (N, 3) beside what it is asked for."""
-    targets, measured, found = ahead(desired), desired[0], []
+    targets, measured, found = next_reference(desired), desired[0], []
     for k in range(len(desired)):
         found.append(100 * np.linalg.norm(measured - desired[k], axis=-1))
-        aim = correction.aim(targets[k], desired[k], measured)
+        aim = correction.shifted(targets[k], desired[k], measured)
         np.testing.assert_allclose(np.linalg.norm(aim, axis=-1), 1.0)
         got = reach(aim)
-        correction.answered(raw=aim[:, :2], applied=got[:, :2])
+        correction.record_output(raw=aim[:, :2], applied=got[:, :2])
         measured = unit(got + off)
     return np.array(found)
 
@@ -45,7 +45,7 @@ def test_the_shift_is_bounded_and_along_the_sphere():
     correction = IntegralCorrection(2, largest=0.2)
     ahead_ = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
     for _ in range(100):  # a robot that does not move at all
-        correction.aim(ahead_, ahead_, np.array([[0.6, 0.0, 0.8], [0.0, 0.0, 1.0]]))
+        correction.shifted(ahead_, ahead_, np.array([[0.6, 0.0, 0.8], [0.0, 0.0, 1.0]]))
     np.testing.assert_allclose(np.linalg.norm(correction.sum, axis=-1), 0.2)
     np.testing.assert_allclose(np.sum(correction.sum * ahead_, axis=-1), 0.0, atol=1e-15)
 
@@ -61,20 +61,20 @@ def test_a_saturated_module_does_not_wind_up():
     still = driven(IntegralCorrection(1), desired, np.zeros((1, 3)), reach)
     assert still[100:].max() < 1e-10
     wound = IntegralCorrection(1)
-    wound.answered = lambda raw, applied: None  # never told that it saturates
+    wound.record_output = lambda raw, applied: None  # never told that it saturates
     assert driven(wound, desired, np.zeros((1, 3)), reach)[101] > 5.0
 
 
 def test_a_saturated_module_lets_go_and_may_always_be_asked_for_less():
     correction = IntegralCorrection(1)
     rest = np.array([[0.0, 0.0, 1.0]])
-    correction.aim(rest, rest, np.array([[-0.1, 0.0, 0.995]]))
+    correction.shifted(rest, rest, np.array([[-0.1, 0.0, 0.995]]))
     before = correction.sum.copy()
-    correction.answered(raw=np.array([[1.4, 0.0]]), applied=np.array([[1.0, 0.0]]))
-    correction.aim(rest, rest, np.array([[-0.1, 0.0, 0.995]]))
+    correction.record_output(raw=np.array([[1.4, 0.0]]), applied=np.array([[1.0, 0.0]]))
+    correction.shifted(rest, rest, np.array([[-0.1, 0.0, 0.995]]))
     np.testing.assert_allclose(correction.sum, 0.5 * before)
-    correction.answered(raw=np.array([[1.4, 0.0]]), applied=np.array([[1.0, 0.0]]))
-    correction.aim(rest, rest, np.array([[0.01, 0.0, 1.0]]))
+    correction.record_output(raw=np.array([[1.4, 0.0]]), applied=np.array([[1.0, 0.0]]))
+    correction.shifted(rest, rest, np.array([[0.01, 0.0, 1.0]]))
     np.testing.assert_allclose(correction.sum[0], 0.5 * before[0] - [0.4 * 0.01, 0.0, 0.0])
 
 

@@ -20,7 +20,7 @@ from modsoft.runtime.control.features import (
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
 from modsoft.runtime.log import plain
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.statistics import Tally
+from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Interrupted, StopKey
 
 REST = np.array([[0.0, 0.0, 1.0]] * 3)
@@ -378,7 +378,7 @@ def test_summary_and_figures():
 
 
 def test_summary_of_a_run_that_never_began():
-    tally = Tally(ROBOT, 10)
+    tally = TickStatistics(ROBOT, 10)
     assert tally.figures()["late_ms"] is None
     assert tally.summary()[0] == "0 of 10 control steps"
 

@@ -110,7 +110,10 @@ def test_two_seals_are_none(model_file, tmp_path):
         (b"", "no seal"),
         (b"PK\x03\x04 and so on", "run modsoft-export on it"),
         (b"name = 'robot'\n", "no seal"),
-        (model_files.sealed(b'junk "file_sha256":"%s"' % model_files.UNSEALED.encode()), "onnxruntime .* refuses it"),
+        (
+            model_files.with_checksum(b'junk "file_sha256":"%s"' % model_files.UNSEALED.encode()),
+            "onnxruntime .* refuses it",
+        ),
     ],
 )
 def test_other_files(tmp_path, content, message):
@@ -166,7 +169,7 @@ def test_golden_pairs_find_other_weights_under_a_good_seal(model_file, tmp_path)
     nudge(model)
     table = onnx_description(model)
     content = model.SerializeToString().replace(table["file_sha256"].encode(), model_files.UNSEALED.encode())
-    (tmp_path / "model.onnx").write_bytes(model_files.sealed(content))
+    (tmp_path / "model.onnx").write_bytes(model_files.with_checksum(content))
     with pytest.raises(ModelError, match="golden pair"):
         Model.load(tmp_path / "model.onnx")
 

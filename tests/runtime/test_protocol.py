@@ -41,7 +41,7 @@ def test_round_trip(message, seq, session):
     assert encoded[0] == encoded[-1] == 0
     assert 0 not in encoded[1:-1]
     assert len(encoded) <= protocol.MAX_ENCODED + 2
-    assert protocol.decode(encoded[1:-1]) == protocol.Frame(seq, session, message)
+    assert protocol.decode(encoded[1:-1]) == protocol.WireFrame(seq, session, message)
 
 
 @given(st.binary(max_size=1000))

@@ -9,25 +9,25 @@ from virtual_loop import PERIOD_S, ROBOT, planar_poses
 from modsoft.runtime import safety
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
-from modsoft.runtime.safety import FrameJudge, Guard, Judgement, check_actuation, check_rest
-from modsoft.runtime.tracking.frame import Frame
+from modsoft.runtime.safety import FaultCounter, FrameCheck, FrameValidator, check_actuation, check_rest
+from modsoft.runtime.tracking.frame import TrackerFrame
 
 
 def frame(number, at_s, angles=(0.0, 0.0, 0.0), **changes):
     poses = planar_poses(angles)
     parts = {"poses": poses, "valid": np.ones(len(poses), bool), "quality": np.full(len(poses), 0.1), "device_hz": 60.0}
-    return Frame(number, at_s, **(parts | changes))
+    return TrackerFrame(number, at_s, **(parts | changes))
 
 
 def settled(start_s=100.0):
     """A judge that has seen one good frame, number 6000 at `start_s`."""
-    judge = FrameJudge(ROBOT)
+    judge = FrameValidator(ROBOT)
     assert judge.judge(frame(6000, start_s), start_s + 0.02).good
     return judge
 
 
 def test_a_good_frame_gives_its_configuration():
-    judged = FrameJudge(ROBOT).judge(frame(1, 100.0, (3.0, 30.0, -40.0)), 100.02)
+    judged = FrameValidator(ROBOT).judge(frame(1, 100.0, (3.0, 30.0, -40.0)), 100.02)
     assert judged.good
     assert judged.age_s == pytest.approx(0.02)
     np.testing.assert_allclose(bending_angle_deg(judged.configuration), [3.0, 30.0, -40.0])
@@ -98,7 +98,7 @@ def test_a_frozen_tracker_is_found_within_three_ticks_whatever_the_phase():
 
 
 def test_a_delay_is_found_although_the_host_sees_fresh_frames():
-    judge = FrameJudge(ROBOT)
+    judge = FrameValidator(ROBOT)
     for step in range(10):
         now_s = 100.0 + step * PERIOD_S
         assert judge.judge(frame(int((now_s - 0.02) * 60), now_s - 0.01), now_s).good
@@ -119,7 +119,7 @@ def test_a_delay_is_found_although_the_host_sees_fresh_frames():
 def test_what_is_not_finite_never_becomes_a_configuration(tool, entry, value):
     poses = planar_poses((5.0, 30.0, 80.0))
     poses[tool][entry] = value
-    judged = FrameJudge(ROBOT).judge(frame(1, 1.0, poses=poses), 1.01)
+    judged = FrameValidator(ROBOT).judge(frame(1, 1.0, poses=poses), 1.01)
     assert judged.word == safety.NOT_FINITE
 
 
@@ -129,35 +129,35 @@ def test_axes_too_large_for_a_length_are_distorted():
     for axes in (np.full((3, 3), 1e200), np.array([[1e200, -1e200, 0.0]] * 3)):
         poses = planar_poses((5.0, 30.0, 80.0))
         poses[1:3, :3, :3] = axes
-        assert FrameJudge(ROBOT).judge(frame(1, 1.0, poses=poses), 1.01).word == safety.DISTORTED
+        assert FrameValidator(ROBOT).judge(frame(1, 1.0, poses=poses), 1.01).word == safety.DISTORTED
 
 
 # ---- what is waited out
 
 
 def test_two_bad_frames_are_waited_out_and_the_third_ends_the_run():
-    guard = Guard(ROBOT)
+    guard = FaultCounter(ROBOT)
     for _ in range(5):
-        guard.frame(Judgement(safety.HIDDEN))
-        guard.frame(Judgement(safety.JUMP))
-        guard.frame(Judgement("good", np.zeros((3, 3))))
-    guard.frame(Judgement(safety.HIDDEN))
-    guard.frame(Judgement(safety.HIDDEN))
+        guard.frame(FrameCheck(safety.HIDDEN))
+        guard.frame(FrameCheck(safety.JUMP))
+        guard.frame(FrameCheck("good", np.zeros((3, 3))))
+    guard.frame(FrameCheck(safety.HIDDEN))
+    guard.frame(FrameCheck(safety.HIDDEN))
     with pytest.raises(Tripped, match=r"3 ticks in a row.*tool hidden \(module 2\)"):
-        guard.frame(Judgement(safety.HIDDEN, detail="module 2"))
+        guard.frame(FrameCheck(safety.HIDDEN, detail="module 2"))
 
 
-@pytest.mark.parametrize("word", safety.GONE)
+@pytest.mark.parametrize("word", safety.TRACKER_LOST)
 def test_a_tracker_that_is_gone_is_lost_not_tripped(word):
-    guard = Guard(ROBOT)
-    guard.frame(Judgement(word))
-    guard.frame(Judgement(word))
+    guard = FaultCounter(ROBOT)
+    guard.frame(FrameCheck(word))
+    guard.frame(FrameCheck(word))
     with pytest.raises(LostInRun, match=word):
-        guard.frame(Judgement(word))
+        guard.frame(FrameCheck(word))
 
 
 def test_more_than_two_missed_ticks_end_the_run():
-    guard = Guard(ROBOT)
+    guard = FaultCounter(ROBOT)
     guard.missed(2)
     guard.on_time()
     guard.missed(1)
@@ -165,7 +165,7 @@ def test_more_than_two_missed_ticks_end_the_run():
     with pytest.raises(Tripped, match="3 control ticks"):
         guard.missed(1)
     with pytest.raises(Tripped, match="8 control ticks"):
-        Guard(ROBOT).missed(8)
+        FaultCounter(ROBOT).missed(8)
 
 
 # ---- what a model may answer, and how a robot may hang
@@ -182,7 +182,7 @@ def test_an_answer_a_little_out_of_range_is_left_to_the_limits():
 
 
 def rest(poses):
-    check_rest(FrameJudge(ROBOT).judge(frame(1, 1.0, poses=poses), 1.0).configuration, poses)
+    check_rest(FrameValidator(ROBOT).judge(frame(1, 1.0, poses=poses), 1.0).configuration, poses)
 
 
 def test_rest():

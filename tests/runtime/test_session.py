@@ -9,10 +9,10 @@ from modsoft.runtime import session
 from modsoft.runtime.board.protocol import VentMode
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped, UsageError
 from modsoft.runtime.log import RunLog
-from modsoft.runtime.safety import FrameJudge
-from modsoft.runtime.statistics import Tally
+from modsoft.runtime.safety import FrameValidator
+from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Interrupted, Stop, StopKey
-from modsoft.runtime.tracking.frame import Slot
+from modsoft.runtime.tracking.frame import LatestFrame
 
 ROBOT = robots.load("pneumatic-3")
 
@@ -23,7 +23,7 @@ class Board:
     def __init__(self, word, pressed=()):
         self.word, self.modes, self.statistics, self.pressed = word, [], {"sets": 3}, dict(pressed)
 
-    def still_pressed(self):
+    def residual_pressures_bar(self):
         return self.pressed
 
     def vent(self, mode):
@@ -40,7 +40,7 @@ class Ending:
         log = RunLog(tmp_path, "arm", "", {})
         self.raised = None
         try:
-            session.finish(board, log, Tally(ROBOT, 10), Slot(), error)
+            session.finish(board, log, TickStatistics(ROBOT, 10), LatestFrame(), error)
         except BaseException as raised:  # noqa: BLE001 - looked at by the test
             self.raised = raised
         self.said = capsys.readouterr().err
@@ -114,7 +114,7 @@ def test_the_venting_is_told_although_the_disk_hangs(tmp_path, capsys, monkeypat
     said = []
     monkeypatch.setattr(RunLog, "close", lambda *told: said.append(capsys.readouterr().err))
     log = RunLog(tmp_path, "arm", "", {})
-    session.finish(Board(True), log, Tally(ROBOT, 10), Slot(), None)
+    session.finish(Board(True), log, TickStatistics(ROBOT, 10), LatestFrame(), None)
     assert "valves vented: yes, said by the board" in said[0]
 
 
@@ -140,9 +140,9 @@ def test_no_frame_is_waited_for_only_so_long(monkeypatch):
     stop = Stop()
     monkeypatch.setattr(stop, "wait", lambda seconds: clock.__setitem__(0, clock[0] + seconds))
     with pytest.raises(session.DeviceAbsent, match="no good frame within 5 s, the last one no frame"):
-        session._rest(Slot(), FrameJudge(ROBOT), stop, lambda: clock[0])
+        session._rest(LatestFrame(), FrameValidator(ROBOT), stop, lambda: clock[0])
     assert clock[0] == pytest.approx(5.0, abs=0.02)
-    slot = Slot()
+    slot = LatestFrame()
     slot.error = OSError("unplugged")
     with pytest.raises(session.DeviceAbsent, match="unplugged"):
-        session._rest(slot, FrameJudge(ROBOT), stop, lambda: clock[0])
+        session._rest(slot, FrameValidator(ROBOT), stop, lambda: clock[0])

@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.tracking import ndi
-from modsoft.runtime.tracking.frame import Frame, Reader, Slot, open_source
+from modsoft.runtime.tracking.frame import LatestFrame, Reader, TrackerFrame, open_source
 from modsoft.runtime.tracking.replay import Replay
 
 ROBOT = robots.load("pneumatic-3")
 
 
-def frame(number: int, at_s: float = 0.0, tools: int = 4) -> Frame:
-    return Frame(number, at_s, np.tile(np.eye(4), (tools, 1, 1)), np.ones(tools, bool), np.full(tools, 0.1))
+def frame(number: int, at_s: float = 0.0, tools: int = 4) -> TrackerFrame:
+    return TrackerFrame(number, at_s, np.tile(np.eye(4), (tools, 1, 1)), np.ones(tools, bool), np.full(tools, 0.1))
 
 
 def test_slot_holds_the_newest_and_counts_the_rest():
-    slot = Slot()
+    slot = LatestFrame()
     assert slot.latest() is None
     for number in (5, 6, 6, 4, 9):
         slot.put(frame(number))
@@ -32,7 +32,7 @@ def test_slot_holds_the_newest_and_counts_the_rest():
 
 
 def test_a_repeated_frame_does_not_become_younger():
-    slot = Slot()
+    slot = LatestFrame()
     slot.put(frame(5, at_s=1.0))
     slot.put(frame(5, at_s=2.0))
     assert slot.latest().monotonic_s == 1.0
@@ -40,7 +40,7 @@ def test_a_repeated_frame_does_not_become_younger():
 
 @given(st.lists(st.integers(0, 20)))
 def test_the_slot_never_goes_back(numbers):
-    slot = Slot()
+    slot = LatestFrame()
     seen = []
     for number in numbers:
         slot.put(frame(number))
@@ -70,7 +70,7 @@ class Scripted:
 
 
 def test_reader_reads_and_closes_in_its_own_thread():
-    source, slot = Scripted([frame(1), None, frame(2)]), Slot()
+    source, slot = Scripted([frame(1), None, frame(2)]), LatestFrame()
     reader = Reader(source, slot)
     assert source.given.wait(5)
     reader.close()
@@ -83,7 +83,7 @@ def test_reader_keeps_the_error_that_ended_it():
     def fail():
         raise OSError("cable")
 
-    source, slot = Scripted([frame(1)], fail), Slot()
+    source, slot = Scripted([frame(1)], fail), LatestFrame()
     Reader(source, slot).close()
     assert str(slot.error) == "cable"
     assert slot.latest().device_frame == 1
@@ -92,7 +92,7 @@ def test_reader_keeps_the_error_that_ended_it():
 
 def test_closing_does_not_wait_for_a_mute_device():
     never = threading.Event()
-    reader = Reader(Scripted([], never.wait), Slot())
+    reader = Reader(Scripted([], never.wait), LatestFrame())
     reader.close()  # within CLOSE_WAIT_S, or the time-out of this test says so
     never.set()
 

@@ -16,7 +16,7 @@ from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import InUse, OutputError
 from modsoft.training.data import collect, dataset
 from modsoft.training.data.episode_store import Shards
-from modsoft.training.simulation.simulators import Plant
+from modsoft.training.simulation.simulators import Simulator
 
 ROBOT = robots.load("pneumatic-2")
 
@@ -26,7 +26,7 @@ def still(robot, actions):
 
 
 def collected(out):
-    return collect.collect(ROBOT, out, 20, "random", 0, 10, plant=Plant("still", still, 1))
+    return collect.collect(ROBOT, out, 20, "random", 0, 10, simulator=Simulator("still", still, 1))
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def test_results_of_jobs_that_were_there_before_are_not_unpickled(tmp_path, part
                 "random",
                 0,
                 10,
-                plant=Plant("still", still, 1),
+                simulator=Simulator("still", still, 1),
                 backend="submitit",
                 options={"cluster": "local"},
             )

@@ -114,7 +114,9 @@ def test_a_description_that_breaks_its_reader(tmp_path, model_file, refused, bef
         entry.value = entry.value.replace(before.decode(), before.decode() + mark)
         content = model.SerializeToString().replace(before + mark.encode(), after)
     seal = model_files._SEAL.search(content)[1]
-    (tmp_path / "model.onnx").write_bytes(model_files.sealed(content.replace(seal, model_files.UNSEALED.encode())))
+    (tmp_path / "model.onnx").write_bytes(
+        model_files.with_checksum(content.replace(seal, model_files.UNSEALED.encode()))
+    )
     refused(Model.load, tmp_path / "model.onnx", "UTF-8|description cannot be read|refuses it")
 
 
@@ -138,5 +140,5 @@ def test_a_model_in_the_other_format_of_onnxruntime(tmp_path, model_file, refuse
     content = path.read_bytes()
     onnxruntime.InferenceSession(content)  # whoever does not say which format takes both
     seal = model_files._SEAL.search(content)[1]
-    path.write_bytes(model_files.sealed(content.replace(seal, model_files.UNSEALED.encode())))
+    path.write_bytes(model_files.with_checksum(content.replace(seal, model_files.UNSEALED.encode())))
     refused(Model.load, path, "onnxruntime .* refuses it")

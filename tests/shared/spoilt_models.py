@@ -43,7 +43,7 @@ def sealed_at(path, model, table):
     table["file_sha256"] = model_files.UNSEALED
     del model.metadata_props[:]
     helper.set_model_props(model, {model_files.METADATA_KEY: model_files.msgspec.json.encode(table).decode()})
-    path.write_bytes(model_files.sealed(model.SerializeToString()))
+    path.write_bytes(model_files.with_checksum(model.SerializeToString()))
     return path
 
 

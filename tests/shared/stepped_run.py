@@ -18,10 +18,10 @@ from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import LostInRun
 from modsoft.runtime.log import RunLog
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.safety import FrameJudge
-from modsoft.runtime.statistics import Tally
+from modsoft.runtime.safety import FrameValidator
+from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Signals, Stop
-from modsoft.runtime.tracking.frame import Frame, Slot
+from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 
 STEPS = 40
 
@@ -39,7 +39,7 @@ class SteppedRun:
         self.clock = self.port.clock
         self.board = Board(self.port, "the emulated MEGA", self.clock, threaded=False)
         self._pump, self.board._line.pump = self.board._line.pump, self.pump
-        self.slot, self.stop, self.tally = Slot(), Stop(), Tally(ROBOT, STEPS)
+        self.slot, self.stop, self.tally = LatestFrame(), Stop(), TickStatistics(ROBOT, STEPS)
         self.stop.wait = self.wait
         self.log = RunLog(folder, ROBOT.name, "", {})
         self.cause_s += self.clock()
@@ -49,7 +49,7 @@ class SteppedRun:
         going_on = self._pump()
         if self.slot.error is None:
             at_s = self.clock()
-            frame = Frame(int(at_s * 60), at_s, planar_poses((1.0, 2.0, 3.0)), np.ones(4, bool), np.full(4, 0.1))
+            frame = TrackerFrame(int(at_s * 60), at_s, planar_poses((1.0, 2.0, 3.0)), np.ones(4, bool), np.full(4, 0.1))
             self.slot.put(frame)
         if self.cause is not None and self.clock() >= self.cause_s:
             cause, self.cause, self.caused_s = self.cause, None, self.clock()
@@ -78,7 +78,7 @@ class SteppedRun:
                 signals.hold()
                 try:
                     self.board.arm(ROBOT)
-                    judge = FrameJudge(ROBOT)
+                    judge = FrameValidator(ROBOT)
                     rest = session._rest(self.slot, judge, self.stop, self.clock, LostInRun)
                     ticker = Ticker(PERIOD_S, self.clock, self.wait)
                     Loop(

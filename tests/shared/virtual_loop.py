@@ -15,10 +15,10 @@ from modsoft.runtime.board.protocol import CHANNELS, State
 from modsoft.runtime.clock import Ticker
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.safety import FrameJudge
-from modsoft.runtime.statistics import Tally
+from modsoft.runtime.safety import FrameValidator
+from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Stop
-from modsoft.runtime.tracking.frame import Frame, Slot
+from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 
 ROBOT = robots.load("pneumatic-3")
 PERIOD_S = ROBOT.loop.period_s
@@ -66,8 +66,8 @@ class World:
         self.angles = (0.0, 0.0, 0.0)  # where the robot hangs, degrees
         self.hidden = ()
         self.dark: list[tuple[float, float]] = []
-        self.spoilt: list[tuple[float, float, Callable[[Frame], Frame]]] = []
-        self.slot = Slot()
+        self.spoilt: list[tuple[float, float, Callable[[TrackerFrame], TrackerFrame]]] = []
+        self.slot = LatestFrame()
         self.slot.put(self.frame())
         self.lines: list[dict[str, Any]] = []
         self.stop = Stop()
@@ -90,13 +90,13 @@ class World:
         # the model
         self.history = 3
         desired = from_angles_deg(np.outer(np.arange(steps), [1.0, 2.0, -3.0][: robot.modules]))
-        self.tally = Tally(robot, steps)
+        self.tally = TickStatistics(robot, steps)
         self.loop = Loop(
             robot,
             self,
             desired,
             self.slot,
-            FrameJudge(robot),
+            FrameValidator(robot),
             self,
             Ticker(PERIOD_S, lambda: self.time_s, self.wait),
             self.stop,
@@ -114,7 +114,7 @@ class World:
         valid[list(self.hidden)] = False
         poses = planar_poses((angles or self.angles)[: count - 1])
         parts = {"poses": poses, "valid": valid, "quality": np.full(count, 0.1)}
-        frame = Frame(int(at_s * 60), at_s, **(parts | changes))
+        frame = TrackerFrame(int(at_s * 60), at_s, **(parts | changes))
         for from_s, to_s, spoil in self.spoilt:
             if from_s <= at_s < to_s:
                 frame = spoil(frame)
@@ -152,7 +152,7 @@ class World:
             self.status.acked_seq, self.ack_latency_s = sequence, 0.007
         return sequence
 
-    def beat(self, tick):
+    def publish_tick(self, tick):
         self.beats.append(tick)
 
     # the model

@@ -83,11 +83,11 @@ def test_a_model_of_other_settings_is_refused_in_one_line(study, ended):
 
 def test_runs_of_a_model_that_changed_and_damaged_ones_are_flown_again(study):
     folder = Folder(study)
-    assert not rollouts.flying(PLAN, folder, 1).items
+    assert not rollouts.rolling_out(PLAN, folder, 1).items
     shutil.copy(folder.onnx(LSTM), folder.onnx(MAIN))
     other = next(run for run in PLAN.runs if run.model not in (MAIN, LSTM))
     folder.run(other).write_bytes(folder.run(other).read_bytes()[:1000])
-    again = {run for batch in rollouts.flying(PLAN, folder, 1).items for run in batch}
+    again = {run for batch in rollouts.rolling_out(PLAN, folder, 1).items for run in batch}
     assert again == {run for run in PLAN.runs if run.model == MAIN} | {other}
 
 
@@ -192,7 +192,7 @@ def test_what_is_left_costs_time_and_what_is_there_hardly_any(made_study, tmp_pa
     begun, done = (
         sum(
             make(PLAN, Folder(out), 2).expected_s(2)
-            for make in (stages.collecting, stages.training, stages.exporting, stages.estimating, rollouts.flying)
+            for make in (stages.collecting, stages.training, stages.exporting, stages.estimating, rollouts.rolling_out)
         )
         for out in (tmp_path, made_study)
     )

@@ -7,7 +7,7 @@ from modsoft.study import measurements, tables
 from modsoft.study.cells import pick
 from modsoft.study.measurements import CONTROL, TIP_DISTANCE, TIP_TILT, record
 from modsoft.study.rollouts import Kept
-from modsoft.training.simulation.rollout import Flight
+from modsoft.training.simulation.rollout import Rollout
 
 PAPER = list(measurements.of_the_paper())
 
@@ -64,7 +64,7 @@ def flown(tip_m, tip_direction, steps=20):
     directors = np.tile(np.eye(3), (steps + 1, 2, 1, 1))
     directors[:, 1, 2] = tip_direction
     desired = np.tile([0.6, 0.0, 0.8], (steps, 2, 1))
-    return Kept(Flight(configuration, np.zeros((steps, 2, 2)), positions, directors), desired)
+    return Kept(Rollout(configuration, np.zeros((steps, 2, 2)), positions, directors), desired)
 
 
 def test_the_end_effector_is_measured_from_the_base_axis():

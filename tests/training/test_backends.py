@@ -13,8 +13,7 @@ from modsoft.runtime.errors import DeviceAbsent, ModelError, UsageError
 from modsoft.training.data import backends
 from modsoft.training.data.workers import WorkerLost
 
-# Simulates with a plant that other processes can import, and that kills its process (mode `die`) when it comes to the
-# third episode for the first time.
+# A simulator that other processes can import; in mode `die` it kills its process at the first try of the third episode.
 STAND_IN = """
     import os, signal
     from pathlib import Path
@@ -25,7 +24,7 @@ STAND_IN = """
     from modsoft.training.data import backends
     from modsoft.training.data.actions import draw_actions
     from modsoft.training.data.collect import collect
-    from modsoft.training.simulation.simulators import Plant
+    from modsoft.training.simulation.simulators import Simulator
 
     class StandIn:
         def __init__(self, mode, marked, flag):
@@ -36,7 +35,7 @@ STAND_IN = """
                 if self.mode == "bug":
                     raise ZeroDivisionError("a bug")
                 if self.mode == "raise":
-                    raise ModelError("no plant")
+                    raise ModelError("no simulator")
                 if self.mode == "always" or not self.flag.exists():
                     self.flag.touch()
                     os.kill(os.getpid(), signal.SIGKILL)
@@ -46,9 +45,10 @@ STAND_IN = """
         backends.SHOWN_S = backends.LOOK_S = 0.1
         robot = robots.load("pneumatic-3")
         rng = np.random.default_rng(np.random.SeedSequence(3, spawn_key=(2, 0)))
-        plant = Plant("stand-in", StandIn(mode, draw_actions(robot, "staged", 30, rng), Path("died").absolute()), 2)
+        actions = draw_actions(robot, "staged", 30, rng)
+        simulator = Simulator("stand-in", StandIn(mode, actions, Path("died").absolute()), 2)
         given = dict(option.split("=") for option in options)
-        made = collect(robot, Path(out), 360, "staged", 3, 30, 2, plant, backend=backend, options=given)
+        made = collect(robot, Path(out), 360, "staged", 3, 30, 2, simulator, backend=backend, options=given)
         print("made", made.samples)
 """
 
@@ -97,7 +97,7 @@ def test_work_that_kills_every_worker_of_dask_ends_with_a_word(tmp_path, monkeyp
 
 def test_dasks_workers_hand_on_the_error_of_the_work(tmp_path):
     pytest.importorskip("distributed", reason="extra dask")
-    assert "ModelError: no plant" in collected(tmp_path, "d.h5", "dask", "raise", expect=1).stderr
+    assert "ModelError: no simulator" in collected(tmp_path, "d.h5", "dask", "raise", expect=1).stderr
     assert not (tmp_path / "d.h5").exists()
 
 
@@ -114,7 +114,7 @@ def test_jobs_of_submitit_make_the_same_and_a_killed_one_is_told_and_gone_on_fro
 @pytest.mark.parametrize(
     ("mode", "told"),
     [
-        ("raise", r"ModelError: no plant$"),
+        ("raise", r"ModelError: no simulator$"),
         ("bug", r"WorkerLost: job \d+(_\d+)? failed: ZeroDivisionError: a bug; all of"),
     ],
 )

@@ -16,7 +16,7 @@ from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.training.data import collect as c
 from modsoft.training.data import dataset
-from modsoft.training.simulation.simulators import Plant
+from modsoft.training.simulation.simulators import Simulator
 
 STAND_IN = """
 import numpy as np
@@ -34,8 +34,8 @@ exec(STAND_IN, namespace)
 simulate = namespace["simulate"]
 
 
-def plant(function=simulate, together: int = 1) -> Plant:
-    return Plant("stand-in", function, together)
+def simulator(function=simulate, batch_size: int = 1) -> Simulator:
+    return Simulator("stand-in", function, batch_size)
 
 
 def test_an_episode_depends_on_seed_and_index_alone():
@@ -54,7 +54,7 @@ def test_a_data_set_carries_its_recipe_and_reads_back(tmp_path):
     robot = of_modules("pneumatic", 3, 0.4)
     out = tmp_path / "d.h5"
     seen = []
-    made = c.collect(robot, out, 100, "staged", 3, 30, plant=plant(), progress=lambda *p: seen.append(p))
+    made = c.collect(robot, out, 100, "staged", 3, 30, simulator=simulator(), progress=lambda *p: seen.append(p))
     assert seen == [(0, 120), (30, 120), (60, 120), (90, 120), (120, 120)]
     assert list(tmp_path.iterdir()) == [out]
     data = dataset.read(out)
@@ -84,7 +84,7 @@ def test_an_episode_that_is_not_finite_is_drawn_again_and_counted(tmp_path, toge
             lost.append(actions[i])
         return configuration
 
-    c.collect(robot, tmp_path / "d.h5", 120, "random", 0, 10, plant=plant(sometimes_lost, together))
+    c.collect(robot, tmp_path / "d.h5", 120, "random", 0, 10, simulator=simulator(sometimes_lost, together))
     data = dataset.read(tmp_path / "d.h5")
     assert data.redrawn == len(lost) > 2
     assert np.all(data.action[:, 0, 0, 0] <= 0.5)
@@ -96,7 +96,7 @@ def test_a_robot_that_is_always_lost_ends_in_an_error(tmp_path):
         return np.full_like(simulate(robot, actions), np.inf)
 
     with pytest.raises(ModelError, match="episode 0: not finite 10 times"):
-        c.collect(of_modules("pneumatic", 2), tmp_path / "d.h5", 10, plant=plant(always_lost))
+        c.collect(of_modules("pneumatic", 2), tmp_path / "d.h5", 10, simulator=simulator(always_lost))
 
 
 def parts_of_one_episode(tmp_path) -> Path:
@@ -109,7 +109,7 @@ def parts_of_one_episode(tmp_path) -> Path:
         return simulate(robot, actions)
 
     with pytest.raises(KeyboardInterrupt):
-        c.collect(of_modules("pneumatic", 3, 0.4), out, 60, "staged", 1, 30, plant=plant(ends))
+        c.collect(of_modules("pneumatic", 3, 0.4), out, 60, "staged", 1, 30, simulator=simulator(ends))
     return out
 
 
@@ -127,10 +127,10 @@ def test_another_recipe_is_refused_and_nothing_is_touched(tmp_path, change, mess
     out = parts_of_one_episode(tmp_path)
     asked = {"robot": of_modules("pneumatic", 3, 0.4), "strategy": "staged", "seed": 1, "steps": 30}
     if finished:
-        c.collect(asked["robot"], out, 60, "staged", 1, 30, plant=plant())
+        c.collect(asked["robot"], out, 60, "staged", 1, 30, simulator=simulator())
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     with pytest.raises(ModelError, match=message):
-        c.collect(out=out, samples=60, plant=plant(), **{**asked, **change})
+        c.collect(out=out, samples=60, simulator=simulator(), **{**asked, **change})
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
 
@@ -152,34 +152,34 @@ def test_a_damaged_episode_is_made_again(tmp_path, damage):
     shard = out.with_name("d.h5.parts") / "episode-000000.npz"
     damage(shard)
     robot = of_modules("pneumatic", 3, 0.4)
-    c.collect(robot, out, 60, "staged", 1, 30, plant=plant())
+    c.collect(robot, out, 60, "staged", 1, 30, simulator=simulator())
     data = dataset.read(out)
     np.testing.assert_array_equal(data.action[0], c.episodes(data.recipe, robot, [0], simulate)[0][1])
 
 
 def test_a_finished_data_set_is_not_made_again(tmp_path):
     robot, out = of_modules("pneumatic", 2), tmp_path / "d.h5"
-    c.collect(robot, out, 20, "random", 0, 10, plant=plant())
+    c.collect(robot, out, 20, "random", 0, 10, simulator=simulator())
     written = out.stat().st_mtime_ns
 
     def never(robot, actions):
         raise AssertionError("simulated again")
 
-    assert c.collect(robot, out, 20, "random", 0, 10, plant=plant(never)).samples == 20
+    assert c.collect(robot, out, 20, "random", 0, 10, simulator=simulator(never)).samples == 20
     assert out.stat().st_mtime_ns == written
     with pytest.raises(ModelError, match="2 episodes of 10 steps, asked for 3"):
-        c.collect(robot, out, 30, "random", 0, 10, plant=plant(never))
+        c.collect(robot, out, 30, "random", 0, 10, simulator=simulator(never))
 
 
 @pytest.mark.parametrize("kept", ["d.h5.parts", ".d.h5.parts.host.12.tmp"])
 def test_what_a_kill_at_the_very_end_left_is_cleared_away(tmp_path, kept):
     out = parts_of_one_episode(tmp_path)
     robot = of_modules("pneumatic", 3, 0.4)
-    c.collect(robot, out, 60, "staged", 1, 30, plant=plant())
+    c.collect(robot, out, 60, "staged", 1, 30, simulator=simulator())
     (tmp_path / kept).mkdir()
     (tmp_path / kept / "episode-000000.npz").touch()
     (tmp_path / ".d.h5.12.tmp").touch()
-    c.collect(robot, out, 60, "staged", 1, 30, plant=plant())
+    c.collect(robot, out, 60, "staged", 1, 30, simulator=simulator())
     assert list(tmp_path.iterdir()) == [out]
 
 
@@ -203,7 +203,7 @@ def test_through_a_link_everything_goes_to_its_target(tmp_path):
     def look(done, samples):
         seen.update(path.name for path in disk.iterdir())
 
-    c.collect(robot, home / "data.h5", 60, "staged", 1, 30, plant=plant(), progress=look)
+    c.collect(robot, home / "data.h5", 60, "staged", 1, 30, simulator=simulator(), progress=look)
     assert seen == {"d.h5.lock", "d.h5.parts"}
     assert [path.name for path in disk.iterdir()] == ["d.h5"]
     assert [path.name for path in home.iterdir()] == ["data.h5"]
@@ -212,7 +212,7 @@ def test_through_a_link_everything_goes_to_its_target(tmp_path):
 
 def test_a_folder_that_is_not_there_is_a_usage_error(tmp_path):
     with pytest.raises(UsageError, match="no folder"):
-        c.collect(of_modules("pneumatic", 2), tmp_path / "none" / "d.h5", 10, plant=plant())
+        c.collect(of_modules("pneumatic", 2), tmp_path / "none" / "d.h5", 10, simulator=simulator())
 
 
 SCRIPT = """
@@ -221,7 +221,7 @@ SCRIPT = """
     import stand_in
     from modsoft.runtime import robot as robots
     from modsoft.training.data.collect import collect
-    from modsoft.training.simulation.simulators import Plant
+    from modsoft.training.simulation.simulators import Simulator
 
     class Slow:
         '''Tells on standard output when it begins an episode, and dawdles.'''
@@ -234,7 +234,7 @@ SCRIPT = """
 
     if __name__ == "__main__":
         collect(robots.load("pneumatic-3"), Path("d.h5"), 360, "staged", 5, 30, jobs=int(sys.argv[1]),
-                plant=Plant("stand-in", Slow(float(sys.argv[2])), together=2))
+                simulator=Simulator("stand-in", Slow(float(sys.argv[2])), batch_size=2))
         print("done", flush=True)
 """
 
@@ -278,14 +278,14 @@ def test_an_error_in_a_worker_ends_the_command_with_its_own_message(tmp_path):
     (tmp_path / "stand_in.py").write_text(
         "from modsoft.runtime.errors import ModelError\n"
         "def simulate(robot, actions):\n"
-        "    raise ModelError('no plant')\n"
+        "    raise ModelError('no simulator')\n"
     )
     (tmp_path / "script.py").write_text(textwrap.dedent(SCRIPT))
     found = subprocess.run(
         [sys.executable, "script.py", "2", "0"], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
     assert found.returncode != 0
-    assert "no plant" in found.stderr
+    assert "no simulator" in found.stderr
     assert not (tmp_path / "d.h5").exists()
     assert json.loads((tmp_path / "d.h5.parts" / "recipe.json").read_text())["seed"] == 5
 
@@ -296,9 +296,10 @@ MEMORY = """
     import stand_in
     from modsoft.runtime import robot as robots
     from modsoft.training.data.collect import collect
-    from modsoft.training.simulation.simulators import Plant
+    from modsoft.training.simulation.simulators import Simulator
 
-    collect(robots.load("cable-4"), Path("d.h5"), int(sys.argv[1]), plant=Plant("stand-in", stand_in.simulate, 8))
+    simulator = Simulator("stand-in", stand_in.simulate, 8)
+    collect(robots.load("cable-4"), Path("d.h5"), int(sys.argv[1]), simulator=simulator)
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 """
 
@@ -320,7 +321,7 @@ def test_memory_does_not_grow_with_the_number_of_samples(tmp_path):
 def test_the_robots_of_a_varied_data_set_differ_from_the_drawing_eight_episodes_alike():
     robot = robots.load("cable-4")
     recipe = c.recipe_of(robot, "varied", 5, 30, "stand-in")
-    found = [c.variation_of(recipe, robot, index) for index in range(400)]
+    found = [c.perturbation_of(recipe, robot, index) for index in range(400)]
     assert len(set(found)) == 50
     assert all(len(set(found[i : i + 8])) == 1 for i in range(0, 400, 8))
     stiffness = np.array([each.stiffness for each in found])
@@ -331,22 +332,22 @@ def test_the_robots_of_a_varied_data_set_differ_from_the_drawing_eight_episodes_
     module_kg = 1050 * np.pi * 0.01**2 * 0.05
     assert 0.1 < np.mean(payloads == 0.0) < 0.5
     assert 2.5 * module_kg < payloads.max() < 4 * module_kg
-    assert c.variation_of(c.recipe_of(robot, "smooth", 5, 30, "stand-in"), robot, 0) is None
+    assert c.perturbation_of(c.recipe_of(robot, "smooth", 5, 30, "stand-in"), robot, 0) is None
 
 
 def test_an_episode_is_simulated_on_its_own_robot_whatever_is_asked_for_with_it():
     robot = robots.load("cable-4")
     recipe = c.recipe_of(robot, "varied", 5, 6, "stand-in")
 
-    def stiff(robot, actions, *, variation):
+    def stiff(robot, actions, *, perturbation):
         angles = np.zeros((len(actions), 7, 4))
-        angles[:, 1:] = 10.0 * actions[..., 0] / np.array(variation.stiffness)
+        angles[:, 1:] = 10.0 * actions[..., 0] / np.array(perturbation.stiffness)
         return from_angles_deg(angles)
 
     together = c.episodes(recipe, robot, [3, 9, 4], stiff)
     for index, episode in zip([3, 9, 4], together, strict=True):
         (alone,) = c.episodes(recipe, robot, [index], stiff)
         np.testing.assert_array_equal(episode.configuration, alone.configuration)
-        factors = np.array(c.variation_of(recipe, robot, index).stiffness)
+        factors = np.array(c.perturbation_of(recipe, robot, index).stiffness)
         expected = from_angles_deg(10.0 * episode.action[..., 0] / factors)
         np.testing.assert_allclose(episode.configuration[1:], expected, atol=1e-12)

@@ -62,7 +62,7 @@ def test_updates_of_a_matrix_are_as_large_as_those_of_adam():
     torch.manual_seed(0)
     network = networks.BiLSTM(6, 1, layers=2, hidden=16)
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    both = optimizer.Optimiser(network)
+    both = optimizer.MuonAndAdam(network)
     for parameter in network.parameters():
         parameter.grad = torch.randn_like(parameter)
     both.step(1e-3)

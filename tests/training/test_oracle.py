@@ -7,7 +7,7 @@ from scipy.optimize import lsq_linear
 
 from modsoft.training.simulation import fleet_kernel, oracle
 from modsoft.training.simulation.fleet import Fleet
-from modsoft.training.simulation.oracle import Floor, floor, greedy, improved
+from modsoft.training.simulation.oracle import OracleResult, greedy, improved, oracle_error
 
 pytestmark = [
     pytest.mark.instructions,
@@ -34,7 +34,7 @@ def beyond_reach(steps=6):
 @pytest.mark.parametrize("modules", [2, 4])
 def test_a_motion_that_the_robot_made_is_found_again(modules):
     desired = motion(modules)
-    found = floor("cable", modules, desired)
+    found = oracle_error("cable", modules, desired)
     assert found.actions.shape == (8, modules, 2)
     assert found.errors.shape == (8, modules)
     assert found.errors.max() < 2e-3
@@ -43,14 +43,14 @@ def test_a_motion_that_the_robot_made_is_found_again(modules):
 
 def test_the_first_error_is_that_of_the_robot_at_rest():
     """The configuration at the start of step 0 is before any action."""
-    found = floor("cable", 2, motion(steps=6)[2:])
+    found = oracle_error("cable", 2, motion(steps=6)[2:])
     at_rest = 100.0 * np.linalg.norm(motion(steps=6)[2] - [0.0, 0.0, 1.0], axis=-1)
     assert np.abs(found.errors[0] - at_rest).max() < 1e-9
     assert found.errors[1:].max() < 2e-3
 
 
 def test_beyond_reach_the_cable_pulls_all_it_can_and_the_other_module_stays():
-    found = floor("cable", 2, beyond_reach())
+    found = oracle_error("cable", 2, beyond_reach())
     assert (np.abs(found.actions) <= 1.0).all()
     assert found.actions[:5, 1, 1].max() < -0.99
     assert 20.0 < found.errors[1:, 1].mean() < 80.0
@@ -58,8 +58,8 @@ def test_beyond_reach_the_cable_pulls_all_it_can_and_the_other_module_stays():
 
 
 def test_the_same_seed_gives_the_same_actions():
-    first, second = (floor("cable", 2, beyond_reach(4), seed=3) for _ in range(2))
-    assert isinstance(first, Floor)
+    first, second = (oracle_error("cable", 2, beyond_reach(4), seed=3) for _ in range(2))
+    assert isinstance(first, OracleResult)
     assert np.array_equal(first.actions, second.actions)
 
 

@@ -11,7 +11,7 @@ from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint
 from modsoft.training.networks import BiLSTM
 from modsoft.training.simulation import rollout
-from modsoft.training.simulation.rollout import Pilot
+from modsoft.training.simulation.rollout import ControllerSetup
 
 pytestmark = pytest.mark.instructions
 
@@ -47,7 +47,7 @@ def inverse(features: np.ndarray) -> np.ndarray:
 def test_the_inverse_of_the_robot_is_everywhere_at_the_right_time():
     robot = robots.load("pneumatic-3")
     desired = tasks.task("edge", "pneumatic", 3)
-    (flight,) = rollout.fly(robot, RobotsOfAngles(3), [Pilot(inverse, 4, desired)])
+    (flight,) = rollout.rollout(robot, RobotsOfAngles(3), [ControllerSetup(inverse, 4, desired)])
     assert flight.configuration.shape == (201, 3, 3)
     assert flight.actions.shape == (200, 3, 1)
     assert (flight.positions.shape, flight.directors.shape) == ((201, 3, 3), (201, 3, 3, 3))
@@ -69,7 +69,7 @@ def test_the_controller_is_fed_as_by_the_runtime_and_held_to_the_largest_step():
 
     arms = RobotsOfAngles(2)
     desired = from_angles_deg(np.outer(np.arange(5), [10.0, 20.0]))
-    (flight,) = rollout.fly(robot, arms, [Pilot(controller, 4, desired)])
+    (flight,) = rollout.rollout(robot, arms, [ControllerSetup(controller, 4, desired)])
     largest = robot.limits.largest_actuation_step
     np.testing.assert_allclose(flight.actions[:, 0, 0], np.minimum(1.0, largest * np.arange(1, 6)))
     np.testing.assert_allclose(flight.actions[:, 1, 0], -0.3)
@@ -88,19 +88,23 @@ def test_the_controller_is_fed_as_by_the_runtime_and_held_to_the_largest_step():
 def test_robots_fly_side_by_side_each_with_its_own_pilot():
     robot = robots.load("pneumatic-3")
     references = [tasks.task(name, "pneumatic", 3) for name in ("edge", "down")]
-    together = rollout.fly(robot, RobotsOfAngles(3, 2), [Pilot(inverse, 4, desired) for desired in references])
+    together = rollout.rollout(
+        robot, RobotsOfAngles(3, 2), [ControllerSetup(inverse, 4, desired) for desired in references]
+    )
     for flight, desired in zip(together, references, strict=True):
-        (alone,) = rollout.fly(robot, RobotsOfAngles(3), [Pilot(inverse, 4, desired)])
+        (alone,) = rollout.rollout(robot, RobotsOfAngles(3), [ControllerSetup(inverse, 4, desired)])
         np.testing.assert_array_equal(flight.configuration, alone.configuration)
     with pytest.raises(ValueError, match="1 pilots for 2 robots"):
-        rollout.fly(robot, RobotsOfAngles(3, 2), [Pilot(inverse, 4, references[0])])
+        rollout.rollout(robot, RobotsOfAngles(3, 2), [ControllerSetup(inverse, 4, references[0])])
 
 
 def test_a_lost_frame_holds_the_action():
     robot = robots.load("pneumatic-3")
     desired = tasks.task("edge", "pneumatic", 3)
-    lost = Pilot(inverse, 4, desired, measure=lambda step, configuration: None if step == 10 else configuration)
-    (flight,) = rollout.fly(robot, RobotsOfAngles(3), [lost])
+    lost = ControllerSetup(
+        inverse, 4, desired, measure=lambda step, configuration: None if step == 10 else configuration
+    )
+    (flight,) = rollout.rollout(robot, RobotsOfAngles(3), [lost])
     np.testing.assert_array_equal(flight.actions[10], flight.actions[9])
     assert np.all(flight.actions[11] != flight.actions[10])
 
@@ -112,8 +116,8 @@ def test_a_correction_takes_off_what_the_network_is_wrong_by():
     def wrong(features):
         return inverse(features) + 0.03
 
-    pilots = [Pilot(wrong, 4, desired), Pilot(wrong, 4, desired, correction.named("integral", 3))]
-    alone, corrected = rollout.fly(robot, RobotsOfAngles(3, 2), pilots)
+    pilots = [ControllerSetup(wrong, 4, desired), ControllerSetup(wrong, 4, desired, correction.named("integral", 3))]
+    alone, corrected = rollout.rollout(robot, RobotsOfAngles(3, 2), pilots)
     np.testing.assert_allclose(rollout.angle_errors_deg(alone.configuration, desired)[1:], 3.0, atol=1e-6)
     assert rollout.angle_errors_deg(corrected.configuration, desired)[20:].max() < 0.1
 
@@ -142,4 +146,6 @@ def test_an_answer_that_the_runtime_refuses_is_refused_in_a_rollout_too():
     robot = robots.load("pneumatic-2")
     desired = from_angles_deg(np.zeros((5, 2)))
     with pytest.raises(ModelError, match="never beyond 3"):
-        rollout.fly(robot, RobotsOfAngles(2), [Pilot(lambda features: np.array([[3.1], [0.0]]), 4, desired)])
+        rollout.rollout(
+            robot, RobotsOfAngles(2), [ControllerSetup(lambda features: np.array([[3.1], [0.0]]), 4, desired)]
+        )

@@ -65,10 +65,10 @@ def test_it_learns_and_the_checkpoint_says_all(tmp_path):
 
 def test_the_loss_is_the_mean_error_rounded_at_zero():
     true = torch.tensor([0.5, -0.5])
-    assert train.loss_of(true, true) == pytest.approx(0.01)
-    assert train.loss_of(true + 0.3, true) == pytest.approx(0.3, rel=1e-3)
+    assert train.charbonnier_loss(true, true) == pytest.approx(0.01)
+    assert train.charbonnier_loss(true + 0.3, true) == pytest.approx(0.3, rel=1e-3)
     small = torch.tensor([1e-4], requires_grad=True)
-    train.loss_of(small, torch.zeros(1)).backward()
+    train.charbonnier_loss(small, torch.zeros(1)).backward()
     assert small.grad.item() == pytest.approx(0.01, rel=1e-3)  # not 1: it ends smoothly
 
 

@@ -48,10 +48,10 @@ from modsoft.runtime.control.ort import onnxruntime
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.robot import Robot
-from modsoft.runtime.safety import FrameJudge
-from modsoft.runtime.statistics import Tally
+from modsoft.runtime.safety import FrameValidator
+from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Stop
-from modsoft.runtime.tracking.frame import Reader, Slot
+from modsoft.runtime.tracking.frame import LatestFrame, Reader
 from modsoft.runtime.tracking.ndi import NDI
 from modsoft.runtime.warmup import WarmUp
 
@@ -114,7 +114,7 @@ class Stamped:
         return stamped
 
 
-class StampedSlot(Slot):
+class StampedLatestFrame(LatestFrame):
     """Keeps for each frame when the tracker had answered and when the frame was there."""
 
     def __init__(self, stamps: Stamps):
@@ -162,7 +162,7 @@ def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict
         try:
             tracker.wait_ready()
             tracker.send({"poses": swinging(modules, 0.0)})
-            slot = StampedSlot(stamps)
+            slot = StampedLatestFrame(stamps)
             reader = Reader(NDI("polaris", str(port), tools, modules + 1), slot)
             controller = Model.load(model)
             controller.warm_up(modules)
@@ -180,7 +180,7 @@ def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict
                 if line.get("sent") and line["verdict"] == "good":
                     lines.append({**stamps, "number": line["frame"]["number"]})
 
-            judge = FrameJudge(robot)
+            judge = FrameValidator(robot)
             desired = np.repeat(from_angles_deg(np.zeros((1, modules))), count, axis=0)
             Loop(
                 robot,
@@ -192,7 +192,7 @@ def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict
                 Ticker(robot.loop.period_s, time.monotonic, spinning(wait)),
                 stop,
                 log,
-                Tally(robot, count),
+                TickStatistics(robot, count),
                 warm_up=WarmUp(robot, controller.actuate, judge, log) if warm else None,
             ).run(from_angles_deg(np.zeros(modules)))
             board.close()

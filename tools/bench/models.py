@@ -16,7 +16,7 @@ from modsoft.runtime.control import correction, tasks
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.entry_point import entry
 from modsoft.training.simulation.fleet import simulated
-from modsoft.training.simulation.rollout import Pilot, angle_errors_deg, configuration_errors_percent, fly
+from modsoft.training.simulation.rollout import ControllerSetup, angle_errors_deg, configuration_errors_percent, rollout
 
 MODELS = Path(__file__).resolve().parents[1] / "models"
 FLOWN = [("pneumatic-3", "pneumatic-3"), ("pneumatic-3", "pneumatic-2"), ("cable-4", "cable-4"), ("cable-4", "cable-6")]
@@ -32,11 +32,13 @@ def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]
     pilots = []
     for task, each in flown:
         desired = tasks.task(task, kind, robot.modules)[:steps]
-        pilots.append(Pilot(controller.actuate, controller.history, desired, correction.named(each, robot.modules)))
+        pilots.append(
+            ControllerSetup(controller.actuate, controller.history, desired, correction.named(each, robot.modules))
+        )
     errors = angle_errors_deg if kind == "pneumatic" else configuration_errors_percent
     rows: list[dict[str, object]] = []
     for (task, each), pilot, flight in zip(
-        flown, pilots, fly(robot, simulated(kind, robot.modules, len(pilots)), pilots), strict=True
+        flown, pilots, rollout(robot, simulated(kind, robot.modules, len(pilots)), pilots), strict=True
     ):
         mean = errors(flight.configuration, pilot.desired).mean(axis=0)
         unit = "degrees" if kind == "pneumatic" else "percent"

@@ -32,7 +32,7 @@ from modsoft.training import plotting
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.elastica import Arm, _Loads, _Simulator
 from modsoft.training.simulation.fleet import Fleet
-from modsoft.training.simulation.parameters import PLANTS, Plant
+from modsoft.training.simulation.parameters import PLANTS, PlantParameters
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,7 +70,7 @@ class Block:
             self.time_s = self.stepper.step(self.simulator, self.time_s, self.plant.time_step_s)
 
 
-def turn_steps(plant: Plant) -> int:
+def turn_steps(plant: PlantParameters) -> int:
     return round(plant.period_s / plant.time_step_s) // TURNS_A_PERIOD
 
 

@@ -102,7 +102,7 @@ class Turns:
 
 
 class Adam(torch.optim.Adam):
-    """Adam for all parameters, with the interface of `muon.Optimiser`."""
+    """Adam for all parameters, with the interface of `muon.MuonAndAdam`."""
 
     def __init__(self, network: torch.nn.Module):
         super().__init__(network.parameters())
@@ -115,7 +115,7 @@ class Adam(torch.optim.Adam):
 
 def adam(race: Race, data: DataSet) -> None:
     """`ours` with another optimizer."""
-    optimizer.Optimiser = Adam  # type: ignore[misc,assignment]
+    optimizer.MuonAndAdam = Adam  # type: ignore[misc,assignment]
     ours(dataclasses.replace(race, iterations=ADAM_TIMES * race.iterations), data)
 
 
@@ -183,7 +183,7 @@ def step_times(rounds: int) -> list[dict[str, Any]]:
         history = train.BY_KIND[robot.robot.kind]["history"]
         sizes = {"feature_size": history * (robot.state_size + robot.action_size) + 1, "action_size": robot.action_size}
         network = networks.build({"name": "bilstm", "layers": 4, "hidden": 128, **sizes})
-        both, features = optimizer.Optimiser(network), torch.randn(batch, robot.modules, sizes["feature_size"])
+        both, features = optimizer.MuonAndAdam(network), torch.randn(batch, robot.modules, sizes["feature_size"])
         times = []
         for _ in range(rounds + 1):  # the first one sets up
             began_s = time.process_time()

@@ -107,7 +107,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     }
     if trouble := reports.write(found, verdict, about, report):
         click.echo(f"modsoft-hil: {trouble}", err=True)
-    for line in [*verdict.acceptances, *verdict.witnesses]:
+    for line in [*verdict.criteria, *verdict.host_load_checks]:
         click.echo(f"{'ok' if line.ok else 'NO':>4}  {line.name}: {line.found} ({line.limit})")
     if found.runtime_exit:
         click.echo(f"modsoft-runtime said: {found.runtime_said or 'nothing'}")

@@ -44,7 +44,7 @@ TRACKING_DEG: dict[tuple[str, int], list[float]] = {
     ("down", 2): [2.0, 3.5],
     ("edge", 2): [1.5, 5.0],
 }
-# The witnesses that the host kept up. Beyond these the timing says more about the host than about the software. A stall
+# Limits of the host-load checks: beyond these the timing says more about the host than about the software. A stall
 # of the board lengthens the acknowledgements that are judged and spares its own time-outs: one heartbeat of it (100 ms;
 # the shortest time-out is 300 ms) hides nothing. The plant catches up; a quarter of a control period is still in time.
 BOARD_LATE_MS = 100.0
@@ -52,7 +52,7 @@ BOARD_SLIPPED_PERCENT = 0.5  # of the run, in stalls
 PLANT_LATE_MS = 100.0
 
 
-class Acceptance(NamedTuple):
+class Criterion(NamedTuple):
     """One line of the verdict. `timing` lines are void on a host that did not keep up."""
 
     name: str
@@ -67,8 +67,8 @@ class Verdict(NamedTuple):
 
     word: str
     reason: str
-    acceptances: list[Acceptance]
-    witnesses: list[Acceptance]
+    criteria: list[Criterion]
+    host_load_checks: list[Criterion]
 
     @property
     def exit_code(self) -> int:
@@ -111,13 +111,13 @@ def measured_off_deg(record: Record) -> Array:
 # ---- Verdict ------------------------------------------------------------------------------------------------------
 
 
-def at_most(name: str, found: float, limit: float, unit: str = "", timing: bool = False) -> Acceptance:
+def at_most(name: str, found: float, limit: float, unit: str = "", timing: bool = False) -> Criterion:
     """A line that holds when found <= limit; NaN never holds."""
     words = f"at most {limit:g}{unit}" if limit else "0"
-    return Acceptance(name, f"{found:.3g}{unit}", words, bool(found <= limit), timing)
+    return Criterion(name, f"{found:.3g}{unit}", words, bool(found <= limit), timing)
 
 
-def acceptances(record: Record) -> list[Acceptance]:
+def criteria(record: Record) -> list[Criterion]:
     """Every acceptance of the run, timing ones marked."""
     count = len(record.tick)
     late_ms = p99(record.lateness_ms)
@@ -131,12 +131,12 @@ def acceptances(record: Record) -> list[Acceptance]:
     faulty = [f"0x{value:04x}" for value in np.unique(record.faults[record.faults != 0])]
     not_running = [state for state in record.state if state != "RUNNING"]
     lines = [
-        Acceptance("exit code of modsoft-runtime", str(record.runtime_exit), "0", record.runtime_exit == 0),
-        Acceptance("ticks", str(count), str(record.steps), count == record.steps),
+        Criterion("exit code of modsoft-runtime", str(record.runtime_exit), "0", record.runtime_exit == 0),
+        Criterion("ticks", str(count), str(record.steps), count == record.steps),
         at_most("desired configurations off the task's own", desired_off(record), DESIRED_OFF),
         at_most("missed ticks", record.missed, MISSED_TICKS, timing=True),
         at_most("ticks held for want of a good tracker frame", record.held, HELD_TICKS, timing=True),
-        Acceptance(
+        Criterion(
             "lateness of a tick, 99th percentile",
             f"{late_ms:.2f} ms",
             f"below {LATENESS_P99_MS:g} ms",
@@ -159,12 +159,12 @@ def acceptances(record: Record) -> list[Acceptance]:
         at_most("largest valve output ever", highest, allowed + VALVE_COUNTS, " counts"),
         at_most("largest duty before the first set-point", largest_duty_before(record), 0.0),
         at_most("ticks without time for the valves to settle", int(np.isnan(differences).sum()), 0),
-        Acceptance("faults of the board", ", ".join(faulty) or "none", "none", not faulty),
+        Criterion("faults of the board", ", ".join(faulty) or "none", "none", not faulty),
         at_most("ticks that the board did not follow", len(not_running), 0),
         at_most("resets in the run", sum(event["event"] == "reset" for event in running), 0),
         at_most("watchdog resets", watchdogs, 0),
         at_most("bytes dropped by the board's receiver", record.board_dropped_bytes, DROPPED_BYTES),
-        Acceptance("the board's word that it vented", "yes" if record.said_vented else "no", "yes", record.said_vented),
+        Criterion("the board's word that it vented", "yes" if record.said_vented else "no", "yes", record.said_vented),
         at_most(
             "valve outputs at 0 for good, after the vent began", vented_after_ms(record), vent_limit_ms(record), " ms"
         ),
@@ -183,11 +183,11 @@ def acceptances(record: Record) -> list[Acceptance]:
             name = f"tracking error of module {module + 1}, mean"
             lines.append(at_most(name, float(mean[module]), limit, "°", timing=True))
     else:
-        lines.append(Acceptance("configuration used, off the plant's own", "no ticks", "some", False))
+        lines.append(Criterion("configuration used, off the plant's own", "no ticks", "some", False))
     return lines
 
 
-def witnesses(record: Record) -> list[Acceptance]:
+def host_load_checks(record: Record) -> list[Criterion]:
     """Whether the board and the plant were real time."""
     plant_ms = float(np.max(record.plant_late_ms)) if len(record.plant_late_ms) else math.nan
     return [
@@ -199,7 +199,7 @@ def witnesses(record: Record) -> list[Acceptance]:
 
 def judge(record: Record) -> Verdict:
     """Passed only when every acceptance holds on a host that kept up, in a run long enough to say so."""
-    lines, seen = acceptances(record), witnesses(record)
+    lines, seen = criteria(record), host_load_checks(record)
     slow = [line for line in seen if not line.ok]
     broken = [line for line in lines if not line.ok and not (line.timing and slow)]
     if broken:

@@ -4,7 +4,7 @@
 each valve channel in [0, 1]; its end ends the process. Standard output, one JSON line each:
 
     {"event": "ready"}                           the robot hangs at rest, time starts
-    {"event": "state", "mono_ns", "t_s", ...}    every slice: what `Plant.state` says; mono_ns is the CLOCK_MONOTONIC
+    {"event": "state", "mono_ns", "t_s", ...}    every slice: `ValvesAndArm.state`; mono_ns is the CLOCK_MONOTONIC
                                                  instant that the slice stands for
     {"event": "summary", ...}                    slices, lateness
 
@@ -87,7 +87,7 @@ def load_robot(robot_file: str | Path) -> Robot:
     return robot
 
 
-class Plant:
+class ValvesAndArm:
     """The arm behind its valves: duties in, poses and chamber pressures out."""
 
     def __init__(self, robot: Robot, arm: PneumaticArm):
@@ -119,7 +119,7 @@ class Plant:
 
 
 def run(
-    plant: Plant,
+    plant: ValvesAndArm,
     duties: Iterator[Array | None],
     write: Callable[[dict[str, Any]], None],
     clock_ns: Callable[[], int] = time.monotonic_ns,
@@ -180,10 +180,10 @@ def cli(robot_file: Path) -> None:
         sys.stdout.flush()
 
     arm = Arm(robot.robot.kind, robot.modules)
-    warm = Plant(robot, arm)
+    warm = ValvesAndArm(robot, arm)
     warm.advance(np.zeros(0), SLICE_S)  # compiles
     arm.reset()
-    run(Plant(robot, arm), duties_from(sys.stdin.fileno()), write)
+    run(ValvesAndArm(robot, arm), duties_from(sys.stdin.fileno()), write)
 
 
 main = entry(cli)

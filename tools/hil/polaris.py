@@ -48,7 +48,7 @@ from modsoft.runtime.tracking.ndi import FRAME_HZ
 SECONDS_A_BYTE = 10 / 115200
 
 
-class Line:
+class Pty:
     """A pseudo-terminal under a name of its own. Its other end is kept open here, so that a client may come and go."""
 
     def __init__(self, link: Path):
@@ -93,7 +93,7 @@ class Line:
 
 
 class Network:
-    """A port of the network, for this machine alone: the `Line` of a device of type vega. One client at a time."""
+    """A port of the network, for this machine alone: the `Pty` of a device of type vega. One client at a time."""
 
     def __init__(self) -> None:
         self.port = 0
@@ -144,7 +144,7 @@ class Network:
         self.master = self._server.fileno()
 
 
-def serve(device: Polaris, line: Line | Network, say: Callable[[dict[str, Any]], None], stdin: int) -> None:
+def serve(device: Polaris, line: Pty | Network, say: Callable[[dict[str, Any]], None], stdin: int) -> None:
     """Until the standard input ends."""
     pending = b""
     while True:
@@ -202,7 +202,7 @@ def cli(link: Path, firmware: str, kind: str, wired: int) -> None:
         sys.stdout.flush()
 
     device = Polaris(firmware=firmware, kind=kind, wired=wired)
-    line = Network() if kind == "vega" else Line(link)
+    line = Network() if kind == "vega" else Pty(link)
     try:
         say({"event": "ready", "port": line.address})
         serve(device, line, say, sys.stdin.fileno())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from modsoft.hil.criteria import Acceptance, Verdict, measured_off_deg, tracking_error_deg
+from modsoft.hil.criteria import Criterion, Verdict, measured_off_deg, tracking_error_deg
 from modsoft.hil.record import Record
 from modsoft.hil.report_folder import FINISHED
 from modsoft.hil.valves import valve_difference
@@ -64,12 +64,12 @@ def write(record: Record, verdict: Verdict, about: dict[str, str], folder: Path)
     """Writes the three files into `folder`, report.json last: where it is, the others are. `about` says what ran, in
     the order it is shown. Returns why there is no picture of the run, if there is none: the text is written anyway."""
     found = figures(record)
-    table = [line._asdict() for line in [*verdict.acceptances, *verdict.witnesses]]
+    table = [line._asdict() for line in [*verdict.criteria, *verdict.host_load_checks]]
     document = {
         "verdict": verdict.word,
         "reason": verdict.reason,
         "about": about,
-        "acceptances": table,
+        "criteria": table,
         "figures": found,
     }
     trouble = ""
@@ -92,10 +92,10 @@ def text(record: Record, verdict: Verdict, about: dict[str, str], found: dict[st
     if record.runtime_exit:
         lines += [f"- modsoft-runtime said: {record.runtime_said or 'nothing'}"]
     lines += ["", "| acceptance | found | limit | |", "| --- | --- | --- | --- |"]
-    void = any(not witness.ok for witness in verdict.witnesses)
-    lines += [_row(line, void) for line in verdict.acceptances]
+    void = any(not check.ok for check in verdict.host_load_checks)
+    lines += [_row(line, void) for line in verdict.criteria]
     lines += ["", "| did the host keep up? | found | limit | |", "| --- | --- | --- | --- |"]
-    lines += [_row(line, False) for line in verdict.witnesses]
+    lines += [_row(line, False) for line in verdict.host_load_checks]
     if "tracking_error_deg" in found:
         lines += ["", trouble or "![desired and reached angles](angles.png)", "", *_tracking_table(found)]
     lines += ["", "| | median | 99th percentile | largest |", "| --- | --- | --- | --- |"]
@@ -113,7 +113,7 @@ TIMES = {
 }
 
 
-def _row(line: Acceptance, void: bool) -> str:
+def _row(line: Criterion, void: bool) -> str:
     word = "void" if line.timing and void else "ok" if line.ok else "**no**"
     return f"| {line.name} | {line.found} | {line.limit} | {word} |"
 

@@ -50,7 +50,14 @@ def study(out: Path, jobs: int | None, quick: bool, only: str | None) -> None:
     asked, folder, processes = plan.quick() if quick else plan.full(), Folder(out), jobs or cores()
     folder.check_own()
     folder.make()
-    makers = (stages.collecting, stages.training, stages.exporting, stages.estimating, rollouts.flying, oracle.finding)
+    makers = (
+        stages.collecting,
+        stages.training,
+        stages.exporting,
+        stages.estimating,
+        rollouts.rolling_out,
+        oracle.finding,
+    )
     writers: dict[str, Callable[[], None]] = {
         "measure": lambda: measurements.measure(asked, folder),
         "figures": lambda: figures.draw(asked, folder),

@@ -96,10 +96,10 @@ def records(plan: Plan, folder: Folder) -> Iterator[Record]:
         yield from by_module(key, np.moveaxis(errors, 1, 0).reshape(errors.shape[1], -1).T)
     for run in plan.runs:
         yield from of_run(table_of(run), run_key(run), rollouts.read(folder.run(run)), run.task)
-    for task, modules in plan.floors:
+    for task, modules in plan.oracle_errors:
         key = {"source": "floor", "task": task, "modules": modules, "seed": 0}
         table = {4: "2", 6: "3"}.get(modules, "modules")
-        yield from of_run(table, key, rollouts.read(folder.floor(task, modules)), task)
+        yield from of_run(table, key, rollouts.read(folder.oracle_error(task, modules)), task)
     yield from of_coverage(folder)
 
 

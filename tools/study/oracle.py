@@ -14,7 +14,7 @@ from modsoft.study.paths import Folder
 from modsoft.study.plan import Plan
 from modsoft.study.scheduler import Stage, Told
 from modsoft.training.simulation.fleet import simulated
-from modsoft.training.simulation.rollout import Flight
+from modsoft.training.simulation.rollout import Rollout
 
 STEP_S = 0.35  # of one core, for a control step of four modules, about
 
@@ -23,7 +23,9 @@ Array = NDArray[np.float64]
 
 def finding(plan: Plan, folder: Folder, jobs: int) -> Stage:
     """floors/*.npz, each a run like any other: what the robot does under the best actions found."""
-    missing = [each for each in plan.floors if rollouts.meta(folder.floor(*each)) != identity(plan, *each)]
+    missing = [
+        each for each in plan.oracle_errors if rollouts.meta(folder.oracle_error(*each)) != identity(plan, *each)
+    ]
     return Stage("oracle", missing, partial(_find, plan, folder), partial(find_s, plan))
 
 
@@ -37,15 +39,15 @@ def identity(plan: Plan, task: str, modules: int) -> dict[str, Any]:
 
 
 def _find(plan: Plan, folder: Folder, each: tuple[str, int], told: Told) -> None:
-    from modsoft.training.simulation.oracle import floor
+    from modsoft.training.simulation.oracle import oracle_error
 
     task, modules = each
     desired = rollouts.desired_of(plan, task, modules)
-    actions, _ = floor("cable", modules, desired, seed=0)
-    rollouts.keep(folder.floor(*each), identity(plan, *each), replay(modules, actions), desired)
+    actions, _ = oracle_error("cable", modules, desired, seed=0)
+    rollouts.keep(folder.oracle_error(*each), identity(plan, *each), replay(modules, actions), desired)
 
 
-def replay(modules: int, actions: Array) -> Flight:
+def replay(modules: int, actions: Array) -> Rollout:
     """What a robot at rest does under actions (K, N, A)."""
     fleet = simulated("cable", modules, 1)
     told = [(fleet.configuration[0], fleet.positions[0], fleet.directors[0])]
@@ -53,4 +55,4 @@ def replay(modules: int, actions: Array) -> Flight:
         fleet.step(action[None])
         told.append((fleet.configuration[0], fleet.positions[0], fleet.directors[0]))
     configuration, positions, directors = (np.stack(values) for values in zip(*told, strict=True))
-    return Flight(configuration, np.asarray(actions), positions, directors)
+    return Rollout(configuration, np.asarray(actions), positions, directors)

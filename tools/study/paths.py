@@ -55,5 +55,5 @@ class Folder:
     def run(self, run: Run) -> Path:
         return self.out / "runs" / f"{run.name}.npz"
 
-    def floor(self, task: str, modules: int) -> Path:
+    def oracle_error(self, task: str, modules: int) -> Path:
         return self.out / "floors" / f"{task}{modules}.npz"

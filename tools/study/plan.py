@@ -1,4 +1,4 @@
-"""What the study consists of: data, models, closed-loop runs, floors. Pure values; who makes them stands elsewhere."""
+"""What the study consists of: data, models, closed-loop runs, oracle errors. Pure values."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Plan:
     mixes: dict[str, tuple[str, ...]]
     models: tuple[Model, ...]
     runs: tuple[Run, ...]
-    floors: tuple[tuple[str, int], ...]  # task, modules
+    oracle_errors: tuple[tuple[str, int], ...]  # task, modules
     settings: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)  # of training, by network and mix
     steps: int | None = None  # of each task; all by default
 
@@ -113,7 +113,7 @@ def full() -> Plan:
         mixes={"paper": (PAPER.name,), "rich": tuple(each.name for each in RICH)},
         models=made,
         runs=runs(made, numbers=(2, 3, 5, 8, 12)),
-        floors=tuple((task, modules) for modules in (4, 6) for task in TASKS),
+        oracle_errors=tuple((task, modules) for modules in (4, 6) for task in TASKS),
         settings={
             ("module-lstm", "paper"): {"batch": 128, "iterations": 1500},
             ("lstm", "paper"): {"batch": 128, "iterations": 6000},
@@ -133,7 +133,7 @@ def quick() -> Plan:
         mixes={"paper": (PAPER.name,), "rich": tuple(each.name for each in RICH)},
         models=made,
         runs=runs(made, numbers=(3,)),
-        floors=(("A", 4),),
+        oracle_errors=(("A", 4),),
         settings={(model.network, model.data): small for model in made},
         steps=12,
     )

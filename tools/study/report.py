@@ -18,7 +18,7 @@ Errors of control are distances of the reached unit vector from the desired one,
 configuration at the start of control step k against target k; errors of estimation are percent of the actuation range.
 `0.97 ± 0.71 (0.91 to 1.03)` is the mean and the standard deviation over the steps (Table 1: the windows of the test
 part), both the mean over the seeds, and the smallest and the largest mean of a seed. Ratio: ours over the paper's.
-Floor: the smallest error that any sequence of actions is known to reach, found by optimising actions on the plant; the
+Oracle error: the smallest error that any sequence of actions is known to reach, found by optimising the actions; the
 true floor may be lower. Marks, set for the biLSTM on rich data: half of the paper's for the network alone; with
 correction a tenth of the paper's, or 1.1 times the floor where that is more. Task B begins with a jump from rest: the
 paper leaves the first steps out, here it is the first five, and the same over all steps stands below it."""

@@ -26,9 +26,10 @@ from modsoft.study import perturbations, stages
 from modsoft.study.paths import NOT_READABLE, Folder
 from modsoft.study.plan import Plan, Run
 from modsoft.study.scheduler import Stage, Told
-from modsoft.training.simulation import fleet, parameters, rollout
+from modsoft.training.simulation import fleet, parameters
+from modsoft.training.simulation import rollout as rollout_module
 from modsoft.training.simulation.fleet import simulated
-from modsoft.training.simulation.rollout import Flight, Pilot, fly
+from modsoft.training.simulation.rollout import ControllerSetup, Rollout, rollout
 
 TOGETHER = 16  # robots of a batch: two blocks of the kernel's widest vectors
 # The code that shapes a run beside the model and the kernel.
@@ -39,7 +40,7 @@ SHAPES: tuple[ModuleType, ...] = (
     model,
     corrections,
     tasks,
-    rollout,
+    rollout_module,
     fleet,
     parameters,
     perturbations,
@@ -52,11 +53,11 @@ Array = NDArray[np.float64]
 class Kept(NamedTuple):
     """A run as it lies in the folder."""
 
-    flight: Flight
+    flight: Rollout
     desired: Array  # (K, N, 3)
 
 
-def flying(plan: Plan, folder: Folder, jobs: int) -> Stage:
+def rolling_out(plan: Plan, folder: Folder, jobs: int) -> Stage:
     """runs/*.npz. A run is made again when its model changed, or anything else that shapes it."""
     models = {run.model for run in plan.runs}
     seals = {model: stages.seal(folder, model) if folder.onnx(model).is_file() else "" for model in models}
@@ -66,10 +67,10 @@ def flying(plan: Plan, folder: Folder, jobs: int) -> Stage:
         for alike in _alike(missing)
         for batch in (alike[first : first + TOGETHER] for first in range(0, len(alike), TOGETHER))
     ]
-    return Stage("rollout", batches, partial(_fly, plan, folder), partial(fly_s, plan))
+    return Stage("rollout", batches, partial(_rollout, plan, folder), partial(rollout_s, plan))
 
 
-def fly_s(plan: Plan, batch: Sequence[Run]) -> float:
+def rollout_s(plan: Plan, batch: Sequence[Run]) -> float:
     return (plan.steps or 250) * STEP_S * batch[0].modules / 4 * max(8, len(batch))
 
 
@@ -111,14 +112,14 @@ def desired_of(plan: Plan, name: str, modules: int) -> Array:
     return task(name, "cable", modules)[: plan.steps]
 
 
-def _fly(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: Told) -> None:
+def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: Told) -> None:
     first = batch[0]
     robot = robots.load(f"cable-{first.modules}")
     models = {run.model: Model.load(folder.onnx(run.model)) for run in batch}
     for each in models.values():
         each.check(robot)
     pilots = [
-        Pilot(
+        ControllerSetup(
             models[run.model].actuate,
             models[run.model].history,
             desired_of(plan, run.task, run.modules),
@@ -130,13 +131,13 @@ def _fly(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: Told) -> None
     variant = perturbations.plant(first.disturbance, first.modules, first.model.seed)
     flown = simulated("cable", first.modules, len(batch), **variant)
     seals = {model: stages.seal(folder, model) for model in models}
-    for run, pilot, flight in zip(batch, pilots, fly(robot, flown, pilots), strict=True):
+    for run, pilot, flight in zip(batch, pilots, rollout(robot, flown, pilots), strict=True):
         if not np.isfinite(flight.configuration).all():
             raise ModelError(f"{run.name}: the simulated robot flew apart; no number is made of this run")
         keep(folder.run(run), identity(plan, run, seals[run.model]), flight, pilot.desired)
 
 
-def keep(path: Path, about: dict[str, Any], flight: Flight, desired: Array) -> None:
+def keep(path: Path, about: dict[str, Any], flight: Rollout, desired: Array) -> None:
     """Writes a run: configuration (K + 1, N, 3), actions (K, N, A), positions (K + 1, N, 3), m, directors
     (K + 1, N, 3, 3), desired (K, N, 3), meta (JSON)."""
     with written(path) as temporary, temporary.open("wb") as file:
@@ -147,9 +148,9 @@ def read(path: Path) -> Kept:
     """A run by its file; `ModelError` where there is none that can be read."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            return Kept(Flight(*(file[name] for name in Flight._fields)), file["desired"])
+            return Kept(Rollout(*(file[name] for name in Rollout._fields)), file["desired"])
     except NOT_READABLE as error:
-        raise ModelError(f"{path}: no run that can be read ({error}); delete it and fly again") from error
+        raise ModelError(f"{path}: no run that can be read ({error}); delete it and run again") from error
 
 
 def meta(path: Path) -> dict[str, Any] | None:

@@ -86,7 +86,7 @@ def _train(plan: Plan, folder: Folder, model: Model, told: Told) -> None:
 
 
 def exporting(plan: Plan, folder: Folder, jobs: int) -> Stage:
-    """models/*.onnx of all models that fly; made again where the checkpoint is younger."""
+    """models/*.onnx of all models that control; made again where the checkpoint is younger."""
     flown = {run.model for run in plan.runs}
     missing = [each for each in plan.models if each in flown and _older(folder.onnx(each), folder.checkpoint(each))]
     return Stage("export", missing, partial(_export, folder), lambda model: EXPORT_S)

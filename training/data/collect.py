@@ -31,7 +31,7 @@ from modsoft.training.data.dataset import Episode
 from modsoft.training.data.episode_store import Shards, refuse_other
 from modsoft.training.simulation import simulators
 from modsoft.training.simulation.parameters import PLANTS
-from modsoft.training.simulation.simulators import Plant, Simulate, Variation
+from modsoft.training.simulation.simulators import Perturbation, Simulate, Simulator
 
 ALIKE = 8  # episodes of a varied data set that have the same robot: the fleet's lanes
 STIFFNESS_OFF = 0.15  # of a module's stiffness, at most
@@ -42,7 +42,7 @@ MOST_ATTEMPTS = 10  # a robot that is not finite so often in a row is broken, no
 Array = NDArray[np.float64]
 
 
-def variation_of(recipe: dict[str, Any], robot: Robot, index: int) -> Variation | None:
+def perturbation_of(recipe: dict[str, Any], robot: Robot, index: int) -> Perturbation | None:
     """How the robot of an episode differs from the drawing: where the strategy is varied, every eight episodes have
     another robot, of which three in ten carry nothing. So the network learns to see in the history what it drives."""
     if recipe["strategy"] != "varied":
@@ -50,17 +50,17 @@ def variation_of(recipe: dict[str, Any], robot: Robot, index: int) -> Variation 
     rng = np.random.default_rng(np.random.SeedSequence(recipe["seed"], spawn_key=(index // ALIKE, 0, VARIED)))
     stiffness = 1.0 + STIFFNESS_OFF * rng.uniform(-1.0, 1.0, robot.modules)
     payload_modules = rng.uniform(0.0, PAYLOAD_MODULES) if rng.uniform() < 0.7 else 0.0
-    return Variation(tuple(stiffness.tolist()), payload_modules * PLANTS[robot.robot.kind].module_kg)
+    return Perturbation(tuple(stiffness.tolist()), payload_modules * PLANTS[robot.robot.kind].module_kg)
 
 
 def episodes(recipe: dict[str, Any], robot: Robot, indices: list[int], simulate: Simulate) -> list[Episode]:
     """The episode of each index. One that is not finite is never kept: the robot is drawn again, and it is counted."""
-    of_variation: dict[Variation | None, list[int]] = {}
+    of_variation: dict[Perturbation | None, list[int]] = {}
     for index in indices:
-        of_variation.setdefault(variation_of(recipe, robot, index), []).append(index)
+        of_variation.setdefault(perturbation_of(recipe, robot, index), []).append(index)
     made: dict[int, Episode] = {}
-    for variation, alike in of_variation.items():
-        drawn = simulate if variation is None else functools.partial(simulate, variation=variation)
+    for perturbation, alike in of_variation.items():
+        drawn = simulate if perturbation is None else functools.partial(simulate, perturbation=perturbation)
         made |= _alike(recipe, robot, alike, drawn)
     return [made[index] for index in indices]
 
@@ -90,8 +90,8 @@ def _alike(
     return made
 
 
-def recipe_of(robot: Robot, strategy: str, seed: int, steps: int, plant: str) -> dict[str, Any]:
-    """All that the numbers of a data set depend on, apart from how many episodes there are. `plant` is its name."""
+def recipe_of(robot: Robot, strategy: str, seed: int, steps: int, simulator: str) -> dict[str, Any]:
+    """All that the numbers of a data set depend on, apart from how many episodes there are. `simulator` is its name."""
     parameters = json.dumps(asdict(PLANTS[robot.robot.kind]), sort_keys=True)
     recipe = {
         "schema": dataset.SCHEMA,
@@ -100,7 +100,7 @@ def recipe_of(robot: Robot, strategy: str, seed: int, steps: int, plant: str) ->
         "seed": seed,
         "steps": steps,
         "period_s": robot.loop.period_s,
-        "plant": plant,
+        "plant": simulator,
         "plant_sha256": hashlib.sha256(parameters.encode()).hexdigest(),
         "code_version": version("modsoft"),
     }
@@ -115,21 +115,21 @@ def collect(
     seed: int = 0,
     steps: int = 300,
     jobs: int = 1,
-    plant: Plant | None = None,
+    simulator: Simulator | None = None,
     progress: Callable[[int, int], None] = lambda done, samples: None,
     backend: str = "local",
     options: dict[str, Any] | None = None,
 ) -> dataset.Header:
     """Makes the data set `out`: at least `samples` control steps in episodes of `steps`.
 
-    What `out` or `out.parts` holds already of the same recipe is kept; of another recipe it is refused. `progress` is
-    told the samples done and the samples in all. plant: the fastest there is by default. backend, jobs, options: who
-    does the work, see `backends.BACKENDS`; none of them changes a number. `InUse` while another process collects it.
+    What `out` or `out.parts` holds already of the same recipe is kept; of another recipe it is refused. `progress`
+    is called with the samples done and the samples in all. simulator: the fastest there is by default. backend, jobs,
+    options: see `backends.BACKENDS`; none of them changes a number. `InUse` while another process collects it.
     """
-    if plant is None:
-        plant = simulators.fastest(robot)
+    if simulator is None:
+        simulator = simulators.fastest(robot)
     count = -(-samples // steps)
-    recipe = recipe_of(robot, strategy, seed, steps, plant.name)
+    recipe = recipe_of(robot, strategy, seed, steps, simulator.name)
     out = target_of(out.absolute())  # workers may be in another folder; the episodes wait beside a link's target
     shards = Shards(out.with_name(f"{out.name}.parts"))
     check_writable(out)
@@ -151,8 +151,8 @@ def collect(
 
         tell()
         missing = sorted(wanted - shards.finished())
-        bundles = [missing[i : i + plant.together] for i in range(0, len(missing), plant.together)]
-        for _ in deal(_Task(recipe, robot, shards, plant.simulate), bundles):
+        bundles = [missing[i : i + simulator.batch_size] for i in range(0, len(missing), simulator.batch_size)]
+        for _ in deal(_Task(recipe, robot, shards, simulator.simulate), bundles):
             tell()
 
         joined = (shards.read(index) for index in range(count))

@@ -16,7 +16,7 @@ from modsoft.runtime.control.actuation import activations
 from modsoft.runtime.control.features import from_directors
 from modsoft.runtime.errors import ModsoftError
 from modsoft.training.simulation.loads import add_loads, follow
-from modsoft.training.simulation.parameters import PASCAL_PER_BAR, PLANTS, Plant
+from modsoft.training.simulation.parameters import PASCAL_PER_BAR, PLANTS, PlantParameters
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class _Simulator(elastica.BaseSystemCollection, elastica.Constraints, elastica.F
 class _Loads(elastica.NoForces):
     """Hands the rod's arrays to `add_loads`, and the pressures to their lags, once a time step."""
 
-    def __init__(self, plant: Plant, state: dict[str, Array]) -> None:
+    def __init__(self, plant: PlantParameters, state: dict[str, Array]) -> None:
         super().__init__()
         actuators = plant.actuators
         angles = np.radians(actuators.angles_deg)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from modsoft.runtime.errors import ModsoftError, UsageError
-from modsoft.training.simulation.parameters import Plant
+from modsoft.training.simulation.parameters import PlantParameters
 
 Damping = Literal["exponential", "explicit"]
 
@@ -79,7 +79,7 @@ def variants() -> list[str]:
     return [] if found is None else [name for i, name in enumerate(allowed) if found.fleet_lanes(i)]
 
 
-def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct:
+def constants(plant: PlantParameters, damping: Damping, time_step_s: float) -> PlantStruct:
     """The plant in the kernel's units, without the three arrays. The rod's own numbers are PyElastica's: a disk's
     second moments, 27/28 for the shear of a section, a third of Young's modulus for shear."""
     length = plant.module_length_m / plant.elements
@@ -123,7 +123,7 @@ def constants(plant: Plant, damping: Damping, time_step_s: float) -> PlantStruct
     )
 
 
-def places(plant: Plant) -> tuple[list[int], list[float]]:
+def places(plant: PlantParameters) -> tuple[list[int], list[float]]:
     """Axis (0 or 1) and place (radii along it) of the actuators that act at a time.
 
     Of two opposite cables only one pulls, so that the pair is one actuator that changes sides: place of the first.
@@ -141,7 +141,7 @@ def places(plant: Plant) -> tuple[list[int], list[float]]:
     return axes, [float(each) for each in actuators.offset_ratio * signs]
 
 
-def alternate(plant: Plant) -> bool:
+def alternate(plant: PlantParameters) -> bool:
     """Whether of two channels in a row never both are under stress, and they stand on opposite sides."""
     actuators = plant.actuators
     apart = np.diff(np.array(actuators.angles_deg).reshape(-1, 2), axis=-1) % 360.0

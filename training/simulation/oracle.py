@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.optimize import lsq_linear
 from scipy.sparse.linalg import spsolve
 
-from modsoft.runtime.control.tasks import ahead
+from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.errors import ModsoftError
 from modsoft.runtime.robot import KINDS
 from modsoft.training.simulation.fleet import Fleet, Snapshot
@@ -34,7 +34,7 @@ HORIZON = 2  # periods that an action is felt for
 SWEEPS = 5
 
 
-class Floor(NamedTuple):
+class OracleResult(NamedTuple):
     """actions (K, N, A) and the errors (K, N) that they leave, percent of the unit vector, of the configuration at the
     start of each period, as the paper counts them."""
 
@@ -48,14 +48,14 @@ class _Found(NamedTuple):
     robot: Snapshot  # after it
 
 
-def floor(kind: str, modules: int, desired: Array, *, seed: int = 0) -> Floor:
+def oracle_error(kind: str, modules: int, desired: Array, *, seed: int = 0) -> OracleResult:
     """The best actions found for `desired` (K, N, 3), the configurations at the start of each period, from rest.
 
     seed: of the guesses that Gauss-Newton's first one competes with. `ModsoftError` if no action keeps the robot whole.
     """
     actions = improved(kind, modules, desired, greedy(kind, modules, desired, seed=seed))
     reached = Fleet(kind, modules, 1).run(actions[:, None])[:, 0]
-    return Floor(actions, configuration_errors_percent(reached, desired))
+    return OracleResult(actions, configuration_errors_percent(reached, desired))
 
 
 def greedy(kind: str, modules: int, desired: Array, *, seed: int = 0) -> Array:
@@ -66,7 +66,7 @@ def greedy(kind: str, modules: int, desired: Array, *, seed: int = 0) -> Array:
     random = np.random.default_rng(seed)
     robot, guess = robots.snapshot([0]), np.zeros(size)
     actions: list[Array] = []
-    for target in ahead(desired):
+    for target in next_reference(desired):
         found = _nearest(robots, robot, target, guess, random)
         before = actions[-1] if actions else found.action
         robot, guess = found.robot, np.clip(2.0 * found.action - before, -1.0, 1.0)
@@ -117,7 +117,7 @@ def _weights(errors: Array) -> Array:
 
 def improved(kind: str, modules: int, desired: Array, actions: Array, *, sweeps: int = SWEEPS) -> Array:
     """`actions` (K, N, A) moved towards the smallest sum of all errors, for as long as that gains anything."""
-    targets = ahead(desired)
+    targets = next_reference(desired)
     robots = Fleet(kind, modules, Fleet(kind, modules, 1).lanes)
     error, taken, configuration = _traced(kind, modules, actions, targets)
     for _ in range(sweeps):

@@ -45,7 +45,7 @@ class Actuators:
 
 
 @dataclass(frozen=True)
-class Plant:
+class PlantParameters:
     """One kind of robot."""
 
     module_length_m: float
@@ -77,7 +77,7 @@ class Plant:
         """Mass of a module without its connector."""
         return self.density_kg_m3 * np.pi * self.radius_m**2 * self.module_length_m
 
-    def carrying(self, tip_payload_kg: float) -> Plant:
+    def carrying(self, tip_payload_kg: float) -> PlantParameters:
         """The same robot with a point mass at its last node, which has weight too."""
         if not 0.0 <= tip_payload_kg < np.inf:
             raise ValueError(f"found a payload of {tip_payload_kg} kg at the tip, expected 0 or more")
@@ -118,7 +118,7 @@ class Plant:
 
 # The robot of the paper's simulations, to the digit (section 2; stated by the authors' published runs). The drag is
 # water's. The explicit rotational damping is only just stable: full-range jumps of long robots can diverge.
-CABLE = Plant(
+CABLE = PlantParameters(
     module_length_m=0.05,
     elements=25,
     radius_m=0.01,
@@ -145,7 +145,7 @@ CABLE = Plant(
 # paper gives pressures and reach, not the modules; these are chosen so that three modules reach 6, 36 and over 90
 # degrees, base first, and the tasks stay within the pressures. Density and modulus are those of a hollow section of
 # soft silicone; the connectors' inertia is spread over the module. Linear damping stands for the losses in the wall.
-PNEUMATIC = Plant(
+PNEUMATIC = PlantParameters(
     module_length_m=0.054,
     elements=6,
     radius_m=0.015,

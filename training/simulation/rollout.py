@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from modsoft.runtime.control.controller import Controller
 from modsoft.runtime.control.correction import Correction, NoCorrection
 from modsoft.runtime.control.features import bending_error_deg
-from modsoft.runtime.control.tasks import ahead
+from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.robot import Robot
 from modsoft.training.checkpoint import network_of
 from modsoft.training.simulation.fleet import Arms, Fleet
@@ -29,7 +29,7 @@ def exactly(step: int, configuration: Array) -> Array | None:
 
 
 @dataclass
-class Pilot:
+class ControllerSetup:
     """Who drives one robot of a fleet through one task.
 
     actuate: features (N, F) -> actuation (N, A); desired (K, N, 3): configurations at the start of each period.
@@ -44,7 +44,7 @@ class Pilot:
     measure: Measure = exactly
 
 
-class Flight(NamedTuple):
+class Rollout(NamedTuple):
     """What one robot did: at the start of every period and after the last, and the actions that were applied."""
 
     configuration: Array  # (K + 1, N, 3)
@@ -53,7 +53,7 @@ class Flight(NamedTuple):
     directors: Array  # (K + 1, N, 3, 3), rows d1, d2, d3 in the lab frame
 
 
-def fly(robot: Robot, robots: Fleet | Arms, pilots: Sequence[Pilot]) -> list[Flight]:
+def rollout(robot: Robot, robots: Fleet | Arms, pilots: Sequence[ControllerSetup]) -> list[Rollout]:
     """Drives `robots`, at rest, each by its own pilot as the runtime would (`modsoft.runtime.loop`): at step k the
     network is asked for desired[k + 1], the state at the end of the period. All tasks have the same length K."""
     steps = len(pilots[0].desired)
@@ -64,7 +64,7 @@ def fly(robot: Robot, robots: Fleet | Arms, pilots: Sequence[Pilot]) -> list[Fli
     controllers = [
         Controller(robot, pilot, rest, pilot.correction) for pilot, rest in zip(pilots, states[0][0], strict=True)
     ]
-    targets = [ahead(pilot.desired) for pilot in pilots]
+    targets = [next_reference(pilot.desired) for pilot in pilots]
     for k in range(steps):
         for b, (pilot, controller) in enumerate(zip(pilots, controllers, strict=True)):
             measured = pilot.measure(k, states[-1][0][b])
@@ -73,7 +73,7 @@ def fly(robot: Robot, robots: Fleet | Arms, pilots: Sequence[Pilot]) -> list[Fli
         robots.step(actions[k], robot.loop.period_s)
         states.append((robots.configuration, robots.positions, robots.directors))
     configuration, positions, directors = (np.stack(values, axis=1) for values in zip(*states, strict=True))
-    return [Flight(configuration[b], actions[:, b], positions[b], directors[b]) for b in range(len(pilots))]
+    return [Rollout(configuration[b], actions[:, b], positions[b], directors[b]) for b in range(len(pilots))]
 
 
 def actuate_with(checkpoint: dict[str, Any]) -> Actuate:

@@ -17,7 +17,7 @@ from modsoft.training.simulation.parameters import PASCAL_PER_BAR, PLANTS
 Array = NDArray[np.float64]
 
 
-class Variation(NamedTuple):
+class Perturbation(NamedTuple):
     """How a robot differs from the drawing."""
 
     stiffness: tuple[float, ...]  # factor of each module
@@ -28,18 +28,18 @@ class Simulate(Protocol):
     """Robot and actions (B, K, N, A) of episodes from rest -> configurations (B, K + 1, N, 3), not finite where a robot
     was lost; what one episode gives does not depend on the others beside it."""
 
-    def __call__(self, robot: Robot, actions: Array, *, variation: Variation | None = None) -> Array: ...
+    def __call__(self, robot: Robot, actions: Array, *, perturbation: Perturbation | None = None) -> Array: ...
 
 
-class Plant(NamedTuple):
+class Simulator(NamedTuple):
     """A simulator that data can be collected from."""
 
     name: str  # goes into the data set: two plants round differently
     simulate: Simulate
-    together: int  # episodes that it likes to simulate at a time
+    batch_size: int  # episodes that it likes to simulate at a time
 
 
-def fastest(robot: Robot) -> Plant:
+def fastest(robot: Robot) -> Simulator:
     """The compiled fleet where this installation has it, else PyElastica."""
     return named(names()[0], robot)
 
@@ -50,31 +50,33 @@ def names() -> list[str]:
     return [*(f"fleet-{variant}" for variant in reversed(fleet_kernel.variants())), "elastica"]
 
 
-def named(name: str, robot: Robot) -> Plant:
+def named(name: str, robot: Robot) -> Simulator:
     """The plant of that name; `UsageError` where it does not run here, `RobotFileError` if it cannot be this robot."""
     if name not in names():
         raise UsageError(f"the simulator {name} does not run here; expected {', '.join(names())}")
     _check(robot)
     if name == "elastica":
-        return Plant(name, by_elastica, together=1)
+        return Simulator(name, by_elastica, batch_size=1)
     # As many as the kernel's lanes: fewer cost the same.
-    return Plant(name, functools.partial(by_fleet, variant=name.removeprefix("fleet-")), together=8)
+    return Simulator(name, functools.partial(by_fleet, variant=name.removeprefix("fleet-")), batch_size=8)
 
 
-def by_fleet(robot: Robot, actions: Array, variant: str | None = None, *, variation: Variation | None = None) -> Array:
+def by_fleet(
+    robot: Robot, actions: Array, variant: str | None = None, *, perturbation: Perturbation | None = None
+) -> Array:
     """Robots side by side in compiled code."""
-    fleet = Fleet(robot.robot.kind, robot.modules, len(actions), variant=variant, **_differences(variation))
+    fleet = Fleet(robot.robot.kind, robot.modules, len(actions), variant=variant, **_overrides(perturbation))
     return _run(fleet, actions, robot.loop.period_s)
 
 
-def by_elastica(robot: Robot, actions: Array, *, variation: Variation | None = None) -> Array:
+def by_elastica(robot: Robot, actions: Array, *, perturbation: Perturbation | None = None) -> Array:
     """One robot after the other in PyElastica, the reference."""
-    arms = Arms(robot.robot.kind, robot.modules, len(actions), **_differences(variation))
+    arms = Arms(robot.robot.kind, robot.modules, len(actions), **_overrides(perturbation))
     return _run(arms, actions, robot.loop.period_s)
 
 
-def _differences(variation: Variation | None) -> dict[str, Any]:
-    return {} if variation is None else variation._asdict()
+def _overrides(perturbation: Perturbation | None) -> dict[str, Any]:
+    return {} if perturbation is None else perturbation._asdict()
 
 
 def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:
