@@ -1,4 +1,4 @@
-// The board between the lab PC and the valves. Thin on purpose: what it decides stands in controller.c and output.c,
+// The board between the lab PC and the valves. Thin on purpose: what it decides stands in supervisor.c and output.c,
 // which are tested on a PC; here they meet the serial port, the pins and the clock.
 //
 // Before flashing, check limits.h (your valves' full scale) and pins.h (your wiring).
@@ -7,14 +7,14 @@
 #include <avr/wdt.h>
 
 #include "boot.h"
-#include "controller.h"
+#include "supervisor.h"
 #include "pins.h"
 #include "pwm.h"
 #include "sensors.h"
 
 #define BYTES_PER_PASS 8  // each way; a pass comes with every byte, or sooner
 
-static struct controller board;
+static struct supervisor board;
 static struct sensors inputs;
 
 void setup() {
@@ -22,7 +22,7 @@ void setup() {
   sensors_begin(&inputs);
   Serial.begin(BAUD);
   const uint32_t id = boot_next_id();
-  controller_init(&board, id, boot_reset_cause(), millis());
+  supervisor_init(&board, id, boot_reset_cause(), millis());
   set_sleep_mode(SLEEP_MODE_IDLE);
   wdt_enable(WDTO_120MS);
 }
@@ -33,16 +33,16 @@ void loop() {
 
   // One frame and a few bytes a pass, so that a flood cannot keep the checks from running.
   for (uint8_t i = 0; i < BYTES_PER_PASS && Serial.available() > 0; i++) {
-    if (controller_receive(&board, (uint8_t)Serial.read(), now_ms)) {
+    if (supervisor_receive(&board, (uint8_t)Serial.read(), now_ms)) {
       break;  // what is left waits for the next interrupt, as the sleep below does
     }
   }
   if (now_ms != last_ms) {  // every byte wakes us; a millisecond is soon enough for all the rest
     last_ms = now_ms;
     sensors_poll(&inputs);
-    const uint8_t checks = controller_update(&board, inputs.measured, inputs.supply_mv, now_ms);
+    const uint8_t checks = supervisor_update(&board, inputs.measured, inputs.supply_mv, now_ms);
     for (uint8_t channel = 0; channel < CHANNELS_USED; channel++) {
-      pwm_write(channel, controller_counts(&board, channel));
+      pwm_write(channel, supervisor_counts(&board, channel));
     }
     if (checks == CHECK_ALL) {
       boot_feed_watchdog(now_ms);
@@ -50,7 +50,7 @@ void loop() {
   }
   // Never waits for the host to read, and never long for the copying: every byte that leaves wakes us for more.
   for (uint8_t i = 0; i < BYTES_PER_PASS && Serial.availableForWrite() > 0; i++) {
-    const int16_t next = controller_next_byte(&board);
+    const int16_t next = supervisor_next_byte(&board);
     if (next < 0) {
       break;
     }

@@ -1,6 +1,6 @@
 """Line and branch coverage of the firmware by its native tests: a table, and exit code 1 below 100 %.
 
-Every file of `firmware/` that is compiled natively counts: the logic (frame.c, output.c, controller.c) and, on a chip
+Every file of `firmware/` that is compiled natively counts: the logic (frame.c, output.c, supervisor.c) and, on a chip
 of plain memory, what touches the hardware (pwm.c, sensors.c, boot.c).
 """
 
@@ -18,8 +18,8 @@ import click
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build" / "coverage"
-FILES = ("frame.c", "output.c", "controller.c", "protocol.h", "pwm.c", "sensors.c", "boot.c")
-TESTS = ("test_frame.py", "test_output.py", "test_controller.py", "test_chip.py")
+FILES = ("frame.c", "output.c", "supervisor.c", "protocol.h", "pwm.c", "sensors.c", "boot.c")
+TESTS = ("test_frame.py", "test_output.py", "test_supervisor.py", "test_chip.py")
 
 
 def _run_tests() -> None:

@@ -26,8 +26,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 EQUIVALENT = Path(__file__).with_name("mutate_equivalent.txt")
 COPIED = ("firmware", "tests/firmware", "tools/fuzz")
-SOURCES = ("output.c", "limits.h", "controller.c", "frame.c", "sensors.c", "boot.c", "pwm.c")
-TESTS = ("test_output.py", "test_controller.py", "test_frame.py", "test_chip.py")
+SOURCES = ("output.c", "limits.h", "supervisor.c", "frame.c", "sensors.c", "boot.c", "pwm.c")
+TESTS = ("test_output.py", "test_supervisor.py", "test_frame.py", "test_chip.py")
 INSTRUMENT = "INSTRUMENT=-O0 -g0 -fsanitize=undefined -fno-sanitize-recover"
 HANGS_AFTER_S = 10  # of processor time; a whole run of the tests takes 4
 

@@ -35,7 +35,7 @@ UNITS_PER_BAR = 100_000 // PRESSURE_UNIT_PA
 
 
 class State(IntEnum):
-    """What the board does; it moves between these only as the firmware's controller.c says."""
+    """What the board does; it moves between these only as the firmware's supervisor.c says."""
 
     BOOT = 0  # pins low, not yet announced
     IDLE = 1  # vented or venting; the only state that can be armed

@@ -47,7 +47,7 @@ class NativeBoard:
 
     def update(self) -> int:
         measured = (ctypes.c_int16 * protocol.CHANNELS)(*self.measured)
-        return self.library.controller_update(self.handle, measured, 5000, ctypes.c_uint32(self.now_ms))
+        return self.library.supervisor_update(self.handle, measured, 5000, ctypes.c_uint32(self.now_ms))
 
     def wait(self, milliseconds: int) -> None:
         for _ in range(milliseconds):
@@ -127,7 +127,7 @@ class NativeBoard:
 
     @property
     def counts(self) -> list[int]:
-        return [self.library.controller_counts(self.handle, channel) for channel in range(protocol.CHANNELS)]
+        return [self.library.supervisor_counts(self.handle, channel) for channel in range(protocol.CHANNELS)]
 
 
 @pytest.fixture(scope="session")
@@ -145,13 +145,13 @@ def native() -> Path:
 @pytest.fixture(scope="session")
 def sanitised(native: Path) -> ctypes.CDLL:
     """The firmware with the undefined-behaviour sanitiser, which ends the test run at the first finding."""
-    library = ctypes.CDLL(str(native / "libcontroller.so"))
+    library = ctypes.CDLL(str(native / "libsupervisor.so"))
     library.board_new.restype = ctypes.c_void_p
-    for function in (library.board_faults, library.controller_counts, library.board_rx_bad):
+    for function in (library.board_faults, library.supervisor_counts, library.board_rx_bad):
         function.restype = ctypes.c_uint16
     for function in (library.board_applied, library.board_set_point):
         function.restype = ctypes.c_int16
-    for function in (library.board_state, library.controller_update):
+    for function in (library.board_state, library.supervisor_update):
         function.restype = ctypes.c_uint8
     library.frame_crc32.restype = ctypes.c_uint32
     return library

@@ -46,10 +46,10 @@ def test_a_path_that_make_cannot_hold_is_one_line(setting):
     assert f"{setting}: make takes no path with spaces or colons" in done.stderr
 
 
-@pytest.mark.parametrize("name", ["frame.c", "output.c", "controller.c"])
+@pytest.mark.parametrize("name", ["frame.c", "output.c", "supervisor.c"])
 def test_logic_includes_no_hardware(name):
     includes = re.findall(r"#include\s+([<\"].*?[>\"])", (FIRMWARE / name).read_text())
-    allowed = {"<stdbool.h>", "<stdint.h>", "<string.h>", '"protocol.h"', '"frame.h"', '"output.h"', '"controller.h"'}
+    allowed = {"<stdbool.h>", "<stdint.h>", "<string.h>", '"protocol.h"', '"frame.h"', '"output.h"', '"supervisor.h"'}
     assert set(includes) <= allowed | {'"limits.h"', '"pins.h"'}
 
 

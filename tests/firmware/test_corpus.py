@@ -22,7 +22,7 @@ def test_no_input_of_the_corpus_breaks_a_rule(native):
 
 def test_the_corpus_would_notice_outputs_that_are_too_fast(native, tmp_path):
     """What a fuzzer never finds proves nothing unless it can be found."""
-    sources = [ROOT / "firmware" / name for name in ("frame.c", "controller.c")]
+    sources = [ROOT / "firmware" / name for name in ("frame.c", "supervisor.c")]
     sources += [FUZZ / name for name in ("target.c", "watched.c", "replay.c")]
     common = ["gcc", f"-I{ROOT / 'firmware'}"]
     hasty = tmp_path / "output.o"

@@ -78,7 +78,7 @@ def test_a_good_frame_with_more_behind_it_in_the_same_frame_is_dropped(board):
 
 def test_only_the_end_of_a_good_frame_is_told_so(board):
     """The sketch takes one good frame a pass."""
-    receive = board.library.controller_receive
+    receive = board.library.supervisor_receive
     receive.restype = ctypes.c_bool
     good = b"\0" + protocol.encode(protocol.HelloReq(protocol.PROTOCOL_HASH), 1, 0).lstrip(b"\0")
     told = [receive(board.handle, byte, ctypes.c_uint32(5)) for byte in good]

@@ -85,7 +85,7 @@ static struct sent next_set(uint8_t ahead) {
 }
 
 static bool is_applied(const struct sent *frame) {
-  const struct controller *board = &host.board;
+  const struct supervisor *board = &host.board;
   return board->state == STATE_RUNNING && board->last_seq == frame->seq && board->set_tick == frame->set.tick &&
          !memcmp(board->set_points, frame->set.pressures, sizeof board->set_points);
 }
@@ -100,7 +100,7 @@ static void send_good(const struct sent *frame) {
 static void try_damaged(enum kind kind) {
   uint8_t bytes[FRAME_MAX_ENCODED + 4];
   struct sent frame = next_set(1);
-  const struct controller before = host.board;
+  const struct supervisor before = host.board;
   uint32_t count = frame_encode(bytes, MESSAGE_SET, frame.seq, host.board.session, &frame.set, sizeof frame.set);
   uint32_t good = 0;
   count = damage(bytes, count, kind);
@@ -118,7 +118,7 @@ static void try_damaged(enum kind kind) {
 }
 
 static void try_repeated(void) {
-  const struct controller before = host.board;
+  const struct supervisor before = host.board;
   uint64_t most = sent_count < HISTORY ? sent_count : HISTORY;
   struct sent frame = history[(sent_count - 1 - draw((uint32_t)most)) % HISTORY];
   uint8_t session = host.board.session;
@@ -195,7 +195,7 @@ static void run(enum kind kind, uint64_t tries) {
     good = next_set(1);
     send_good(&good);
     pass();
-    for (uint32_t i = 0; done % 4 == 0 && i < sizeof sink && controller_next_byte(&host.board) >= 0; i++) {
+    for (uint32_t i = 0; done % 4 == 0 && i < sizeof sink && supervisor_next_byte(&host.board) >= 0; i++) {
     }
   }
 }

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Coverage-guided fuzzing of the firmware's parser and controller: `make fuzz`, or tools/fuzz/run.sh [SECONDS].
+# Coverage-guided fuzzing of the firmware's parser and supervisor: `make fuzz`, or tools/fuzz/run.sh [SECONDS].
 # Starts from the corpus beside this file; what is found new goes to build/fuzz/corpus, a finding to build/fuzz.
 set -eu
 cd "$(dirname "$0")/../.."

@@ -37,7 +37,7 @@ static void take_into(struct input *input, void *to, uint8_t length) {
 }
 
 /* The payload as an honest host would have written it, as far as the board is to be reached at all. */
-static void repair(const struct controller *board, uint8_t type, uint8_t *payload) {
+static void repair(const struct supervisor *board, uint8_t type, uint8_t *payload) {
   struct set *set = (struct set *)payload;
   struct arm *arm = (struct arm *)payload;
   switch (type) {
@@ -89,7 +89,7 @@ static void frame(struct watched *w, struct input *input, uint8_t which) {
 static void drain(struct watched *w, struct frame_parser *host) {
   struct frame seen;
   int16_t byte;
-  while ((byte = controller_next_byte(&w->board)) >= 0) {
+  while ((byte = supervisor_next_byte(&w->board)) >= 0) {
     if (byte != PROTOCOL_DELIMITER) {
       frame_take(host, (uint8_t)byte);
     } else if (frame_end(host, &seen) == FRAME_BAD) {

@@ -28,15 +28,15 @@ void watched_begin(struct watched *w, uint32_t now_ms) {
   memset(w, 0, sizeof *w);
   memset(&w->board, 0xa5, sizeof w->board); /* as memory is after power-on */
   w->now_ms = now_ms;
-  controller_init(&w->board, BOOT_ID, RESET_CAUSE_POWER_ON, now_ms);
+  supervisor_init(&w->board, BOOT_ID, RESET_CAUSE_POWER_ON, now_ms);
   watched_follow(w, false);
   watched_pass(w, 0);
 }
 
-bool watched_receive(struct watched *w, uint8_t byte) { return controller_receive(&w->board, byte, w->now_ms); }
+bool watched_receive(struct watched *w, uint8_t byte) { return supervisor_receive(&w->board, byte, w->now_ms); }
 
 void watched_pass(struct watched *w, uint32_t elapsed_ms) {
-  struct controller *board = &w->board;
+  struct supervisor *board = &w->board;
   const int16_t *now = board->output.applied;
   int16_t before[PROTOCOL_CHANNELS];
   int32_t step = (int32_t)(SLEW * (elapsed_ms < STALL_MS ? elapsed_ms : STALL_MS) / 1000);
@@ -44,7 +44,7 @@ void watched_pass(struct watched *w, uint32_t elapsed_ms) {
        "a frame moved an output, not to 0");
   memcpy(before, now, sizeof before);
   w->now_ms += elapsed_ms;
-  must(w, controller_update(board, w->measured, 5000, w->now_ms) == CHECK_ALL, "a pass left a check out");
+  must(w, supervisor_update(board, w->measured, 5000, w->now_ms) == CHECK_ALL, "a pass left a check out");
 
   bool running = board->state == STATE_RUNNING;
   must(w, (board->state == STATE_FAULT) == (board->faults != 0), "a fault is not latched, or none in FAULT");
@@ -63,8 +63,8 @@ void watched_pass(struct watched *w, uint32_t elapsed_ms) {
     must(w, is <= was + step + 1, "an output rises faster than SLEW");
     must(w, is == 0 || is >= was - step - 1, "an output falls faster than SLEW, not to 0");
     must(w, driven || is <= (was > step ? was - step : 0), "an output that nobody drives does not vent");
-    must(w, controller_counts(board, channel) <= PWM_COUNTS * P_MAX / P_FULL + 1 &&
-                (is != 0 || controller_counts(board, channel) == 0),
+    must(w, supervisor_counts(board, channel) <= PWM_COUNTS * P_MAX / P_FULL + 1 &&
+                (is != 0 || supervisor_counts(board, channel) == 0),
          "counts that are not the output's");
   }
   memcpy(w->applied, now, sizeof w->applied);
@@ -79,7 +79,7 @@ void watched_send(struct watched *w, uint8_t type, uint8_t seq, uint8_t session,
 }
 
 void watched_run(struct watched *w, int16_t pressure) {
-  struct controller *board = &w->board;
+  struct supervisor *board = &w->board;
   struct vent dump = {VENT_MODE_DUMP};
   struct clear_fault clear;
   struct heartbeat beat = {board->tick};

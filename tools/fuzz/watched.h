@@ -5,12 +5,12 @@
 
 #include <stdint.h>
 
-#include "controller.h"
+#include "supervisor.h"
 
 #define BOOT_ID 0xb0a4dUL
 
 struct watched {
-  struct controller board;
+  struct supervisor board;
   uint32_t now_ms;
   int16_t measured[PROTOCOL_CHANNELS]; /* what the sensors read, 10 Pa; the caller's to change */
   int16_t applied[PROTOCOL_CHANNELS];  /* by the last pass */

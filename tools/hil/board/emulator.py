@@ -56,7 +56,7 @@ _BOARD_SOURCES: dict[BoardName, tuple[Path, ...]] = {
     "simavr": tuple(SOURCES / name for name in (*_COMMON, "board.c", "board_outputs.c", "board_uart.c")),
     "native": (
         *(SOURCES / name for name in (*_COMMON, "native_board.c")),
-        *(FIRMWARE / name for name in ("frame.c", "output.c", "controller.c")),
+        *(FIRMWARE / name for name in ("frame.c", "output.c", "supervisor.c")),
     ),
 }
 _COMPILE = ("gcc", "-O2", "-g", "-std=gnu11", "-Wall", "-Wextra", f"-I{SOURCES}", f"-I{FIRMWARE}")

@@ -1,4 +1,4 @@
-/* The second board: the firmware's own logic (frame.c, output.c, controller.c) compiled for this machine.
+/* The second board: the firmware's own logic (frame.c, output.c, supervisor.c) compiled for this machine.
  *
  * For machines without simavr. Same commands and events as board.c, same pacing, same serial line; but firmware.ino and
  * everything below it is replaced by this file: no bootloader, no timer registers (duties are what the logic asks for),
@@ -7,7 +7,7 @@
 
 #include <string.h>
 
-#include "controller.h"
+#include "supervisor.h"
 #include "limits.h"
 #include "pins.h"
 
@@ -21,7 +21,7 @@ const char *const board_name = "native";
 const unsigned board_channels = CHANNELS_USED;
 struct board_load board_load;
 
-static struct controller logic;
+static struct supervisor logic;
 static ticks_t now, next_loop, started, watchdog_fed, tx_free, rx_end;
 static uint32_t boot_id;
 static int rx_now = -1;
@@ -40,7 +40,7 @@ static void start(uint8_t cause, const char *name)
     started = next_loop = watchdog_fed = now + STARTUP_TICKS;
     tx_free = 0;
     report_reset(name);
-    controller_init(&logic, boot_id, cause, 0);
+    supervisor_init(&logic, boot_id, cause, 0);
     for (unsigned channel = 0; channel < board_channels; channel++)
         if (counts_now[channel])
             report_duty(channel, counts_now[channel] = 0, 0, 0);
@@ -48,9 +48,9 @@ static void start(uint8_t cause, const char *name)
 
 static void loop(void)
 {
-    uint8_t checks = controller_update(&logic, measured, ADC_FULL_MV, now_ms());
+    uint8_t checks = supervisor_update(&logic, measured, ADC_FULL_MV, now_ms());
     for (unsigned channel = 0; channel < board_channels; channel++) {
-        unsigned counts = controller_counts(&logic, channel);
+        unsigned counts = supervisor_counts(&logic, channel);
         if (counts == counts_now[channel])
             continue;
         counts_now[channel] = counts;
@@ -58,7 +58,7 @@ static void loop(void)
     }
     ticks_t byte_ticks = (ticks_t)TICKS_PER_SECOND * 10 / BAUD;
     while (tx_free < now + TX_BUFFER * byte_ticks) {
-        int16_t byte = controller_next_byte(&logic);
+        int16_t byte = supervisor_next_byte(&logic);
         if (byte < 0)
             break;
         tx_free = (tx_free > now ? tx_free : now) + byte_ticks;
@@ -83,7 +83,7 @@ void board_run(ticks_t until)
         now = next > now ? next : now;
         bool arrived = rx_now >= 0 && now >= rx_end, listens = !hung && now >= started;
         if (arrived && listens)
-            controller_receive(&logic, (uint8_t)rx_now, now_ms());
+            supervisor_receive(&logic, (uint8_t)rx_now, now_ms());
         if (arrived)
             rx_now = -1;
         if (listens && (arrived || now >= next_loop)) {

@@ -60,8 +60,8 @@ def test_status_comes_every_tenth_of_a_second(board):
         assert board.messages() == []
         board.wait(1)
         assert len(board.messages()) == 1
-    board.library.controller_next_byte.restype = ctypes.c_int16
-    assert board.library.controller_next_byte(board.handle) == -1
+    board.library.supervisor_next_byte.restype = ctypes.c_int16
+    assert board.library.supervisor_next_byte(board.handle) == -1
 
 
 def test_hello_on_request_in_any_state(running):

@@ -5,8 +5,8 @@
  *   any  -> FAULT (latched, vents) -CLEAR_FAULT of exactly those faults, pressures down-> IDLE
  *
  * Outputs follow set-points in RUNNING alone; in every other state their target is 0. */
-#ifndef CONTROLLER_H
-#define CONTROLLER_H
+#ifndef SUPERVISOR_H
+#define SUPERVISOR_H
 
 #include <stdbool.h>
 #include <stdint.h>
@@ -22,7 +22,7 @@ extern "C" {
 /* The checks of one pass; the hardware watchdog is fed only after all of them. */
 enum check { CHECK_LINK = 1, CHECK_CONTROL = 2, CHECK_SENSORS = 4, CHECK_OUTPUTS = 8, CHECK_ALL = 15 };
 
-struct controller {
+struct supervisor {
   uint8_t state;      /* enum state */
   uint16_t faults;    /* enum fault, latched */
   uint32_t boot_id;
@@ -58,21 +58,21 @@ struct controller {
 };
 
 /* Starts vented, in BOOT, with the HELLO already queued. */
-void controller_init(struct controller *c, uint32_t boot_id, uint8_t reset_cause, uint32_t now_ms);
+void supervisor_init(struct supervisor *s, uint32_t boot_id, uint8_t reset_cause, uint32_t now_ms);
 
 /* One byte from the host. Returns true when it ended a good frame, which has been carried out or refused then. */
-bool controller_receive(struct controller *c, uint8_t byte, uint32_t now_ms);
+bool supervisor_receive(struct supervisor *s, uint8_t byte, uint32_t now_ms);
 
 /* Once a loop: timers, faults, outputs, STATUS. measured is in 10 Pa, PROTOCOL_NOT_MEASURED where there is no sensor.
  * Returns the checks done, CHECK_ALL when all is well; then, and only then, the watchdog may be fed. */
-uint8_t controller_update(struct controller *c, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,
+uint8_t supervisor_update(struct supervisor *s, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,
                           uint32_t now_ms);
 
 /* PWM counts of a channel, see output.h. */
-uint16_t controller_counts(const struct controller *c, uint8_t channel);
+uint16_t supervisor_counts(const struct supervisor *s, uint8_t channel);
 
 /* Next byte for the host, or -1. What does not fit the queue is dropped as whole frames: the board never waits. */
-int16_t controller_next_byte(struct controller *c);
+int16_t supervisor_next_byte(struct supervisor *s);
 
 #ifdef __cplusplus
 }
