@@ -9,7 +9,7 @@
 #endif
 
 /* What a byte does to the CRC is the sum (exclusive or) of what its bits do, so these eight make the whole table. */
-#define BIT(byte, bit, effect) ((byte) >> (bit)&1 ? effect : 0)
+#define BIT(byte, bit, effect) ((byte) >> (bit) & 1 ? effect : 0)
 #define ENTRY(byte)                                                                                                    \
   (BIT(byte, 0, 0x77073096UL) ^ BIT(byte, 1, 0xee0e612cUL) ^ BIT(byte, 2, 0x076dc419UL) ^ BIT(byte, 3, 0x0edb8832UL) ^ \
    BIT(byte, 4, 0x1db71064UL) ^ BIT(byte, 5, 0x3b6e20c8UL) ^ BIT(byte, 6, 0x76dc4190UL) ^ BIT(byte, 7, 0xedb88320UL))

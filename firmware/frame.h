@@ -23,8 +23,8 @@ enum frame_event { FRAME_NONE, FRAME_GOOD, FRAME_BAD };
 
 /* Decodes byte by byte; zeroed memory is a valid start. */
 struct frame_parser {
-  uint8_t length; /* of what is decoded so far */
-  uint8_t remaining;    /* bytes of the current COBS run still to come */
+  uint8_t length;    /* of what is decoded so far */
+  uint8_t remaining; /* bytes of the current COBS run still to come */
   bool zero_pending; /* the last run ends in a zero, unless the frame ends first */
   bool started;      /* something came since the last delimiter */
   bool broken;       /* too long: dropped up to the next delimiter */
@@ -43,8 +43,7 @@ enum frame_event frame_end(struct frame_parser *parser, struct frame *frame);
 #define FRAME_MAX_ENCODED (PROTOCOL_MAX_ENCODED + 2)
 
 /* Writes a whole frame with its delimiters, returns its length. The payload must fit PROTOCOL_MAX_DECODED. */
-uint8_t frame_encode(uint8_t *encoded, uint8_t type, uint8_t seq, uint8_t session, const void *payload,
-                     uint8_t length);
+uint8_t frame_encode(uint8_t *encoded, uint8_t type, uint8_t seq, uint8_t session, const void *payload, uint8_t length);
 
 /* CRC-32 as zlib computes it. */
 uint32_t frame_crc32(const uint8_t *data, uint8_t length);

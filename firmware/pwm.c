@@ -7,11 +7,11 @@
 
 /* Fast PWM with the top in ICRn (mode 14), no prescaler, nothing connected yet. The Arduino core has set these timers
  * up for its own 8-bit analogWrite before. */
-#define BEGIN_TIMER(n)                          \
-  TCCR##n##B = 0;                               \
-  TCCR##n##A = _BV(WGM##n##1);                  \
-  ICR##n = PWM_TOP;                             \
-  TCNT##n = 0;                                  \
+#define BEGIN_TIMER(n)         \
+  TCCR##n##B = 0;              \
+  TCCR##n##A = _BV(WGM##n##1); \
+  ICR##n = PWM_TOP;            \
+  TCNT##n = 0;                 \
   TCCR##n##B = _BV(WGM##n##3) | _BV(WGM##n##2) | _BV(CS##n##0);
 
 #define BEGIN_PIN(channel, pin, timer, unit, port, bit) \
@@ -20,18 +20,18 @@
     DDR##port |= _BV(bit);                              \
   }
 
-#define WRITE_PIN(channel, pin, timer, unit, port, bit)       \
-  case channel:                                               \
-    if (channel >= CHANNELS_USED) {                           \
-      break;                                                  \
-    }                                                         \
-    if (counts == 0) {                                        \
-      TCCR##timer##A &= (uint8_t)~_BV(COM##timer##unit##1);   \
-      OCR##timer##unit = 0;                                   \
-    } else {                                                  \
-      OCR##timer##unit = counts - 1;                          \
-      TCCR##timer##A |= _BV(COM##timer##unit##1);             \
-    }                                                         \
+#define WRITE_PIN(channel, pin, timer, unit, port, bit)     \
+  case channel:                                             \
+    if (channel >= CHANNELS_USED) {                         \
+      break;                                                \
+    }                                                       \
+    if (counts == 0) {                                      \
+      TCCR##timer##A &= (uint8_t)~_BV(COM##timer##unit##1); \
+      OCR##timer##unit = 0;                                 \
+    } else {                                                \
+      OCR##timer##unit = counts - 1;                        \
+      TCCR##timer##A |= _BV(COM##timer##unit##1);           \
+    }                                                       \
     break;
 
 void pwm_begin(void) {

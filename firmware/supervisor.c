@@ -1,3 +1,4 @@
+/* More than 300 lines: every transition of the state machine is in one file, where it can be checked at a glance. */
 #include "supervisor.h"
 
 #include <string.h>

@@ -23,17 +23,17 @@ extern "C" {
 enum check { CHECK_LINK = 1, CHECK_CONTROL = 2, CHECK_SENSORS = 4, CHECK_OUTPUTS = 8, CHECK_ALL = 15 };
 
 struct supervisor {
-  uint8_t state;      /* enum state */
-  uint16_t faults;    /* enum fault, latched */
+  uint8_t state;   /* enum state */
+  uint16_t faults; /* enum fault, latched */
   uint32_t boot_id;
   uint8_t reset_cause;
   uint32_t now_ms; /* of the last update */
 
-  uint8_t session;         /* the last one armed; 0 before the first */
-  uint16_t channels;       /* bit c: this session drives channel c */
-  uint8_t last_seq;        /* of the last SET accepted; in ARMED of the ARM */
-  uint32_t tick;           /* the host's control loop, as last told */
-  uint32_t set_tick;       /* of the last SET accepted */
+  uint8_t session;   /* the last one armed; 0 before the first */
+  uint16_t channels; /* bit c: this session drives channel c */
+  uint8_t last_seq;  /* of the last SET accepted; in ARMED of the ARM */
+  uint32_t tick;     /* the host's control loop, as last told */
+  uint32_t set_tick; /* of the last SET accepted */
   int16_t set_points[PROTOCOL_CHANNELS];
 
   bool hears_heartbeats;

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import clang_format
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -37,6 +38,20 @@ def test_imports_go_one_way(part):
 def test_style():
     subprocess.run([sys.executable, "-m", "ruff", "check", "."], cwd=ROOT, check=True)
     subprocess.run([sys.executable, "-m", "ruff", "format", "--check", "."], cwd=ROOT, check=True)
+
+
+C_SOURCES = sorted(
+    path
+    for folder in ("firmware", "tests", "tools", "training")
+    for path in (ROOT / folder).rglob("*")
+    if path.suffix in {".c", ".h", ".ino"}
+)
+
+
+def test_style_of_c():
+    program = clang_format.get_executable("clang-format")
+    subprocess.run([program, "--dry-run", "-Werror", *C_SOURCES], cwd=ROOT, check=True)
+    assert [path.name for path in C_SOURCES if max(map(len, path.read_text().splitlines())) > 120] == []
 
 
 def test_firmware_header_is_generated_from_the_protocol():

@@ -9,5 +9,7 @@ for part in runtime training export; do ln -sfn "../../../$part" "build/types/mo
 for part in hil study; do ln -sfn "../../../tools/$part" "build/types/modsoft/$part"; done
 "$bin/ruff" check .
 "$bin/ruff" format --check --quiet .
+find firmware tests tools training \( -name '*.[ch]' -o -name '*.ino' \) -exec \
+    "$bin/python" -c 'import clang_format; clang_format.clang_format()' --dry-run -Werror {} +
 "$bin/python" tools/gen_protocol.py --check
 "$bin/mypy" -p modsoft.runtime -p modsoft.export -p modsoft.hil -p modsoft.training -p modsoft.study

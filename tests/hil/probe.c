@@ -24,6 +24,16 @@ static uint16_t analogue(uint8_t input) {
   return ADC;
 }
 
+static void echo_at_250000_baud(void) {
+  while (!(UCSR0A & _BV(TXC0))) {
+  }
+  UCSR0A = 0;
+  UBRR0 = 3;
+  for (;;) {
+    send(receive());
+  }
+}
+
 int main(void) {
   UBRR0 = 16;
   UCSR0A = _BV(U2X0);
@@ -36,7 +46,7 @@ int main(void) {
   for (;;) {
     const uint8_t command = receive();
     switch (command) {
-      case 'd': /* deaf for ten byte times and more, then tell what was kept */
+      case 'd': /* does not read for more than ten byte times, then sends what was kept */
         _delay_ms(5);
         while (UCSR0A & _BV(RXC0)) {
           send(UDR0);
@@ -69,20 +79,15 @@ int main(void) {
         send((uint8_t)counts);
         break;
       }
-      case 's': /* asleep for ever */
+      case 's': /* sleeps until a reset */
         cli();
         SMCR = _BV(SE);
         __asm__ volatile("sleep");
         break;
-      case 'e': /* echoes for ever at 250000 baud */
+      case 'e':
         send(command);
-        while (!(UCSR0A & _BV(TXC0))) {
-        }
-        UCSR0A = 0;
-        UBRR0 = 3;
-        for (;;) {
-          send(receive());
-        }
+        echo_at_250000_baud();
+        break;
       default:
         break;
     }

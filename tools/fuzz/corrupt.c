@@ -212,9 +212,10 @@ int main(int argc, char **argv) {
   }
   random_state = (argc > 3 ? strtoull(argv[3], NULL, 10) : 1) * 2654435761u + 88172645463325252u;
   run(kind, tries);
-  printf("{\"kind\":\"%s\",\"tries\":%llu,\"whole\":%llu,\"wrong\":%llu,\"lost\":%llu,\"silences\":%llu,"
-         "\"latest_vent_ms\":%u}\n",
-         names[kind], (unsigned long long)tries, (unsigned long long)whole, (unsigned long long)wrong,
-         (unsigned long long)lost, (unsigned long long)silences, (unsigned)latest_vent_ms);
+  printf(
+      "{\"kind\":\"%s\",\"tries\":%llu,\"whole\":%llu,\"wrong\":%llu,\"lost\":%llu,\"silences\":%llu,"
+      "\"latest_vent_ms\":%u}\n",
+      names[kind], (unsigned long long)tries, (unsigned long long)whole, (unsigned long long)wrong,
+      (unsigned long long)lost, (unsigned long long)silences, (unsigned)latest_vent_ms);
   return wrong || lost;
 }

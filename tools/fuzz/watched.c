@@ -63,8 +63,9 @@ void watched_pass(struct watched *w, uint32_t elapsed_ms) {
     must(w, is <= was + step + 1, "an output rises faster than SLEW");
     must(w, is == 0 || is >= was - step - 1, "an output falls faster than SLEW, not to 0");
     must(w, driven || is <= (was > step ? was - step : 0), "an output that nobody drives does not vent");
-    must(w, supervisor_counts(board, channel) <= PWM_COUNTS * P_MAX / P_FULL + 1 &&
-                (is != 0 || supervisor_counts(board, channel) == 0),
+    must(w,
+         supervisor_counts(board, channel) <= PWM_COUNTS * P_MAX / P_FULL + 1 &&
+             (is != 0 || supervisor_counts(board, channel) == 0),
          "counts that are not the output's");
   }
   memcpy(w->applied, now, sizeof w->applied);

@@ -13,24 +13,24 @@ enum { ACTUATORS = 2 }; /* that act on a module at a time */
 /* One kind of robot; what makes its elements unlike stands in the three arrays. fleet.py fills it in, field by field.
  * Units: the rest length of an element, the time step, and newton; so a velocity is in rest lengths a time step. */
 struct plant {
-    int64_t second;             /* 0 or 1: the director that the second actuator is along; the first is along 0 */
-    int64_t lags;               /* whether the actuators follow their goal late */
-    double tiny;                /* added to the length of an element, as PyElastica does */
-    double shear, stretch;      /* stiffness of a section */
-    double bend[2];             /* and twist: couple of half a curvature, at rigidity 1 */
-    double half_damping;        /* negative; on the sum of an element's two node velocities; each node takes half */
-    double drag[2];             /* across and along; on that sum squared, half of it likewise */
-    double weight[4];           /* of an actuator's stress, powers of its stretch */
-    double longest;             /* stretch beyond which an actuator is slack */
-    double valve_share, chamber_share; /* of the way to go, a time step */
-    double friction, friction_curvature; /* of the wall: couple of half a curvature, and the half where it slips */
-    double gravity_kick;        /* velocity of a time step */
-    double gyration[2];         /* time steps of the rotational kick, of axes 0 and 1 and of axis 2 */
-    double turn_kick[2];        /* angular velocity of a unit torque, likewise */
-    double fade_kick[2];        /* damping of the rotation at rest length, likewise */
-    const double *mobility;     /* (elements + 1): velocity that a unit force gives a node in a time step */
-    const double *stiffness;    /* (elements): of shear and stretch, over that of the kind */
-    const double *rigidity;     /* (elements - 1): of bend and twist in a Voronoi domain, likewise */
+  int64_t second;        /* 0 or 1: the director that the second actuator is along; the first is along 0 */
+  int64_t lags;          /* whether the actuators follow their goal late */
+  double tiny;           /* added to the length of an element, as PyElastica does */
+  double shear, stretch; /* stiffness of a section */
+  double bend[2];        /* and twist: couple of half a curvature, at rigidity 1 */
+  double half_damping;   /* negative; on the sum of an element's two node velocities; each node takes half */
+  double drag[2];        /* across and along; on that sum squared, half of it likewise */
+  double weight[4];      /* of an actuator's stress, powers of its stretch */
+  double longest;        /* stretch beyond which an actuator is slack */
+  double valve_share, chamber_share;   /* of the way to go, a time step */
+  double friction, friction_curvature; /* of the wall: couple of half a curvature, and the half where it slips */
+  double gravity_kick;                 /* velocity of a time step */
+  double gyration[2];                  /* time steps of the rotational kick, of axes 0 and 1 and of axis 2 */
+  double turn_kick[2];                 /* angular velocity of a unit torque, likewise */
+  double fade_kick[2];                 /* damping of the rotation at rest length, likewise */
+  const double *mobility;              /* (elements + 1): velocity that a unit force gives a node in a time step */
+  const double *stiffness;             /* (elements): of shear and stretch, over that of the kind */
+  const double *rigidity;              /* (elements - 1): of bend and twist in a Voronoi domain, likewise */
 };
 
 /* Elements a stage stays behind the first one, so that the stages of one turn of the loop do not wait for each other
@@ -78,20 +78,22 @@ enum { LAG_C = 2, LAG_D = 4, RING = 8 };
 #endif
 
 /* Lanes (robots in a block) of a variant: 0 plain C, 1 AVX2, 2 AVX-512. 0 where this processor cannot run it. */
-int fleet_lanes(int variant)
-{
-    if (variant == 0)
-        return 2;
+int fleet_lanes(int variant) {
+  if (variant == 0) {
+    return 2;
+  }
 #if defined(__x86_64__)
-    __builtin_cpu_init();
-    int avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-    if (variant == 1 && avx2)
-        return 4;
-    if (variant == 2 && avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-        __builtin_cpu_supports("avx512vl"))
-        return 8;
+  __builtin_cpu_init();
+  int avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+  if (variant == 1 && avx2) {
+    return 4;
+  }
+  if (variant == 2 && avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+      __builtin_cpu_supports("avx512vl")) {
+    return 8;
+  }
 #endif
-    return 0;
+  return 0;
 }
 
 int fleet_plant_bytes(void) { return (int)sizeof(struct plant); }
@@ -102,28 +104,34 @@ int fleet_plant_bytes(void) { return (int)sizeof(struct plant); }
  * state (blocks, elements + 1, 20, lanes): struct element, k beside the node before it; the last node has no element.
  * Both start on a multiple of 8 * lanes bytes.
  */
-void fleet_advance(int variant, const struct plant *plant, int blocks, int modules, int per_module,
-                   double *drive, double *state, long steps)
-{
-    for (int b = 0; b < blocks; b++) {
-        switch (variant) {
-        case 0: advance_plain(plant, b, modules, per_module, drive, state, steps); break;
+void fleet_advance(int variant, const struct plant *plant, int blocks, int modules, int per_module, double *drive,
+                   double *state, long steps) {
+  for (int b = 0; b < blocks; b++) {
+    switch (variant) {
+      case 0:
+        advance_plain(plant, b, modules, per_module, drive, state, steps);
+        break;
 #if defined(__x86_64__)
-        case 1: advance_avx2(plant, b, modules, per_module, drive, state, steps); break;
-        case 2: advance_avx512(plant, b, modules, per_module, drive, state, steps); break;
+      case 1:
+        advance_avx2(plant, b, modules, per_module, drive, state, steps);
+        break;
+      case 2:
+        advance_avx512(plant, b, modules, per_module, drive, state, steps);
+        break;
 #endif
-        }
     }
+  }
 }
 
 /* rounds * 12 * lanes multiply-adds, whose result keeps the compiler from leaving them out. */
-double fleet_peak(int variant, long rounds)
-{
+double fleet_peak(int variant, long rounds) {
 #if defined(__x86_64__)
-    if (variant == 2)
-        return peak_avx512(rounds);
-    if (variant == 1)
-        return peak_avx2(rounds);
+  if (variant == 2) {
+    return peak_avx512(rounds);
+  }
+  if (variant == 1) {
+    return peak_avx2(rounds);
+  }
 #endif
-    return variant == 0 ? peak_plain(rounds) : 0.0;
+  return variant == 0 ? peak_plain(rounds) : 0.0;
 }

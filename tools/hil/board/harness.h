@@ -1,6 +1,6 @@
 /* What the two emulated boards share, and what each of them has to give.
  *
- * board.c (the compiled firmware on simavr) and native_board.c (the firmware's logic compiled for this machine) implement
+ * board.c (the compiled firmware on simavr) and native_board.c (the firmware's logic compiled for this machine) define
  * the board_* functions; line.c (the serial line as a pseudo terminal), events.c and harness.c (main, commands,
  * pacing) are the same for both. The commands and events are described at the top of board.c. */
 #ifndef HARNESS_H
@@ -22,11 +22,11 @@ typedef uint64_t ticks_t;
 #define MAX_CHANNELS 16
 
 struct options {
-    const char *firmware;   /* ELF or Intel hex; the native board has its own compiled in */
-    const char *bootloader; /* Intel hex, or NULL: the reset vector is then the firmware's */
-    const char *port_link;  /* symbolic link to be made to the serial port */
-    bool fast;              /* do not hold emulated time to real time */
-    bool stepped;           /* emulated time stands still but for the command `run` */
+  const char *firmware;   /* ELF or Intel hex; the native board has its own compiled in */
+  const char *bootloader; /* Intel hex, or NULL: the reset vector is then the firmware's */
+  const char *port_link;  /* symbolic link to be made to the serial port */
+  bool fast;              /* do not hold emulated time to real time */
+  bool stepped;           /* emulated time stands still but for the command `run` */
 };
 
 /* --- a board ----------------------------------------------------------------------------------------------------- */
@@ -35,31 +35,32 @@ extern const char *const board_name;
 extern const unsigned board_channels;
 
 struct board_load {
-    ticks_t slept;     /* since the last reset, the firmware's own sleep */
-    ticks_t max_awake; /* longest stretch from one sleep to the next: the firmware's worst loop; 0 where not emulated */
+  ticks_t slept;     /* since the last reset, the firmware's own sleep */
+  ticks_t max_awake; /* longest stretch from one sleep to the next: the firmware's worst loop; 0 where not emulated */
 };
 extern struct board_load board_load;
 
 void board_power_on(const struct options *options);
 ticks_t board_now(void);
-void board_run(ticks_t until); /* may overshoot by one instruction */
-void board_reset_pin(void);    /* what DTR does when the port is opened */
-void board_power_cycle(void);  /* a reset that also loses the RAM */
+void board_run(ticks_t until);  /* may overshoot by one instruction */
+void board_reset_pin(void);     /* what DTR does when the port is opened */
+void board_power_cycle(void);   /* a reset that also loses the RAM */
 bool board_runs_firmware(void); /* false: in reset, or in the bootloader */
-bool board_hang(bool deaf);    /* no progress in the main loop until the next reset, interrupts off too if deaf; false: not now */
+bool board_hang(
+    bool deaf); /* no progress in the main loop until the next reset, interrupts off too if deaf; false: not now */
 void board_set_adc(unsigned input, unsigned millivolt);
 
 /* --- the serial line (line.c) ------------------------------------------------------------------------------------ */
 
 struct line_counters {
-    uint64_t rx, tx;                   /* bytes that the board received, sent */
-    uint64_t rx_bootloader;            /* that the host wrote while the board was in reset or in its bootloader */
-    uint64_t rx_corrupted, rx_dropped; /* by the injected noise */
-    uint64_t tx_corrupted, tx_dropped;
-    uint64_t rx_overrun;               /* lost in the UART: the firmware was too slow */
-    uint64_t tx_unread;                /* lost because the host did not read */
-    uint64_t from_host, to_host;       /* taken from and given to the pseudo terminal */
-    uint64_t wrong_baud;               /* garbled: host and board set different rates */
+  uint64_t rx, tx;                   /* bytes that the board received, sent */
+  uint64_t rx_bootloader;            /* that the host wrote while the board was in reset or in its bootloader */
+  uint64_t rx_corrupted, rx_dropped; /* by the injected noise */
+  uint64_t tx_corrupted, tx_dropped;
+  uint64_t rx_overrun;         /* lost in the UART: the firmware was too slow */
+  uint64_t tx_unread;          /* lost because the host did not read */
+  uint64_t from_host, to_host; /* taken from and given to the pseudo terminal */
+  uint64_t wrong_baud;         /* garbled: host and board set different rates */
 };
 extern struct line_counters line_counters;
 
@@ -67,11 +68,11 @@ void line_open(const char *link);
 void line_unplug(void);
 void line_plug(const char *link);
 const char *line_port(void);
-bool line_is_open(void);                          /* a host has it open */
-void line_poll(void);                             /* once a slice: opened or closed, bytes in */
-void line_flush(ticks_t now);                     /* once a slice: bytes out whose stop bit has passed */
-int line_next_byte(uint32_t board_baud);          /* the byte that starts to arrive now, or -1; 0: nobody listens */
-ticks_t line_byte_ticks(void);                    /* how long it takes to arrive, at the host's rate */
+bool line_is_open(void);                 /* a host has it open */
+void line_poll(void);                    /* once a slice: opened or closed, bytes in */
+void line_flush(ticks_t now);            /* once a slice: bytes out whose stop bit has passed */
+int line_next_byte(uint32_t board_baud); /* the byte that starts to arrive now, or -1; 0: nobody listens */
+ticks_t line_byte_ticks(void);           /* how long it takes to arrive, at the host's rate */
 void line_send(ticks_t end, uint8_t byte, uint32_t board_baud);
 bool line_command(const char *verb, double probability);
 void line_flood(ticks_t duration);

@@ -1,8 +1,8 @@
 /* The serial line of the emulated board: a pseudo terminal, DTR, baud rates, and noise.
  *
- * simavr's own uart_pty is not used: it dies after a flood and hides that the host went away. Here the slave side is kept
- * closed, so POLLHUP on the master means "the host has closed the port" and its clearing means "opened", which on a MEGA
- * pulls DTR and resets the board. */
+ * simavr's own uart_pty is not used: it dies after a flood and hides that the host closed the port. Here the slave side
+ * stays closed, so POLLHUP on the master means "the host has closed the port", and its clearing means "opened", which
+ * pulls DTR on a MEGA and resets the board. */
 #define _GNU_SOURCE
 #include "harness.h"
 
@@ -18,8 +18,8 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#define BITS_PER_BYTE 10   /* start, eight data, stop */
-#define RX_ROOM 512        /* like the USB chip's buffer: when it is full the host's write() waits */
+#define BITS_PER_BYTE 10 /* start, eight data, stop */
+#define RX_ROOM 512      /* like the USB chip's buffer: when it is full the host's write() waits */
 #define TX_ROOM 4096
 #define BAUD_TOLERANCE 0.04
 
@@ -33,229 +33,231 @@ static ticks_t next_baud_poll, flood_until;
 
 static uint8_t rx[RX_ROOM];
 static size_t rx_first, rx_count;
-static struct { ticks_t end; uint8_t byte; } tx[TX_ROOM];
+static struct {
+  ticks_t end;
+  uint8_t byte;
+} tx[TX_ROOM];
 static size_t tx_first, tx_count;
 
 static double corrupt_rx, drop_rx, insert_rx, corrupt_tx, drop_tx;
 
-static bool chance(double probability)
-{
-    return probability > 0 && random_u32() < probability * 4294967296.0;
+static bool chance(double probability) { return probability > 0 && random_u32() < probability * 4294967296.0; }
+
+static void make_link(const char *link) {
+  struct stat there;
+  snprintf(link_name, sizeof link_name, "%s", link);
+  if (lstat(link_name, &there) == 0 && S_ISLNK(there.st_mode)) {
+    unlink(link_name); /* left behind by a board that was killed; anything else is not ours to remove */
+  }
+  if (symlink(slave_name, link_name) != 0) {
+    fail(EXIT_USAGE, "cannot make the port link %s: %s", link_name, strerror(errno));
+  }
 }
 
-static void make_link(const char *link)
-{
-    struct stat there;
-    snprintf(link_name, sizeof link_name, "%s", link);
-    if (lstat(link_name, &there) == 0 && S_ISLNK(there.st_mode))
-        unlink(link_name); /* left behind by a board that was killed; anything else is not ours to remove */
-    if (symlink(slave_name, link_name) != 0)
-        fail(EXIT_USAGE, "cannot make the port link %s: %s", link_name, strerror(errno));
+void line_open(const char *link) {
+  master = posix_openpt(O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
+  if (master < 0 || grantpt(master) != 0 || unlockpt(master) != 0 || ptsname_r(master, slave_name, sizeof slave_name)) {
+    fail(EXIT_INTERNAL, "cannot make a pseudo terminal: %s", strerror(errno));
+  }
+  /* Opened once: it makes the line raw before the first host comes, and POLLHUP is only reported after a close. */
+  int slave = open(slave_name, O_RDWR | O_NOCTTY | O_CLOEXEC);
+  struct termios2 raw;
+  if (slave < 0 || ioctl(slave, TCGETS2, &raw) != 0) {
+    fail(EXIT_INTERNAL, "cannot open the pseudo terminal %s: %s", slave_name, strerror(errno));
+  }
+  raw.c_iflag = 0;
+  raw.c_oflag = 0;
+  raw.c_lflag = 0;
+  raw.c_cflag = (raw.c_cflag & ~(CSIZE | PARENB)) | CS8 | CREAD | CLOCAL;
+  ioctl(slave, TCSETS2, &raw);
+  close(slave);
+  host_open = false;
+  make_link(link);
 }
 
-void line_open(const char *link)
-{
-    master = posix_openpt(O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
-    if (master < 0 || grantpt(master) != 0 || unlockpt(master) != 0 || ptsname_r(master, slave_name, sizeof slave_name))
-        fail(EXIT_INTERNAL, "cannot make a pseudo terminal: %s", strerror(errno));
-    /* Opened once: it makes the line raw before the first host comes, and POLLHUP is only reported after a close. */
-    int slave = open(slave_name, O_RDWR | O_NOCTTY | O_CLOEXEC);
-    struct termios2 raw;
-    if (slave < 0 || ioctl(slave, TCGETS2, &raw) != 0)
-        fail(EXIT_INTERNAL, "cannot open the pseudo terminal %s: %s", slave_name, strerror(errno));
-    raw.c_iflag = 0;
-    raw.c_oflag = 0;
-    raw.c_lflag = 0;
-    raw.c_cflag = (raw.c_cflag & ~(CSIZE | PARENB)) | CS8 | CREAD | CLOCAL;
-    ioctl(slave, TCSETS2, &raw);
-    close(slave);
-    host_open = false;
-    make_link(link);
+void line_unplug(void) {
+  if (master < 0) {
+    return;
+  }
+  unlink(link_name);
+  close(master); /* the host's next read fails, as with a USB cable that was pulled */
+  master = -1;
+  rx_count = tx_count = 0;
+  if (host_open) {
+    event("uart-close", "\"unplugged\":true");
+  }
+  host_open = false;
 }
 
-void line_unplug(void)
-{
-    if (master < 0)
-        return;
-    unlink(link_name);
-    close(master); /* the host's next read fails, as with a USB cable that was pulled */
-    master = -1;
-    rx_count = tx_count = 0;
-    if (host_open)
-        event("uart-close", "\"unplugged\":true");
-    host_open = false;
+void line_plug(const char *link) {
+  if (master >= 0) {
+    return;
+  }
+  char previous[sizeof link_name];
+  memcpy(previous, link_name, sizeof previous);
+  line_open(*link ? link : previous);
 }
 
-void line_plug(const char *link)
-{
-    if (master >= 0)
-        return;
-    char previous[sizeof link_name];
-    memcpy(previous, link_name, sizeof previous);
-    line_open(*link ? link : previous);
-}
+const char *line_port(void) { return slave_name; }
 
-const char *line_port(void)
-{
-    return slave_name;
-}
-
-bool line_is_open(void)
-{
-    return host_open;
-}
+bool line_is_open(void) { return host_open; }
 
 /* The host's termios, seen from the master. Rate 0 is how a host drops DTR with termios alone. */
-static void poll_baud(void)
-{
-    struct termios2 host;
-    if (ioctl(master, TCGETS2, &host) != 0)
-        return;
-    uint32_t baud = (host.c_cflag & CBAUD) == B0 ? 0 : host.c_ospeed;
-    if (baud != host_baud)
-        wrong_baud_reported = false;
-    if (baud)
-        host_baud = baud;
-    if (!baud)
-        dtr_low = true;
-    else if (dtr_low) {
-        dtr_low = false;
-        event("dtr-pulse", "\"baud\":%u", baud);
-        board_reset_pin();
-    }
+static void poll_baud(void) {
+  struct termios2 host;
+  if (ioctl(master, TCGETS2, &host) != 0) {
+    return;
+  }
+  uint32_t baud = (host.c_cflag & CBAUD) == B0 ? 0 : host.c_ospeed;
+  if (baud != host_baud) {
+    wrong_baud_reported = false;
+  }
+  if (baud) {
+    host_baud = baud;
+  }
+  if (!baud) {
+    dtr_low = true;
+  } else if (dtr_low) {
+    dtr_low = false;
+    event("dtr-pulse", "\"baud\":%u", baud);
+    board_reset_pin();
+  }
 }
 
-void line_poll(void)
-{
-    if (master < 0)
-        return;
-    struct pollfd port = {.fd = master, .events = POLLIN};
-    poll(&port, 1, 0);
-    bool open_now = !(port.revents & POLLHUP);
-    if (open_now && !host_open) {
-        host_open = true;
-        dtr_low = false;
-        poll_baud();
-        event("uart-open", "\"baud\":%u", host_baud);
-        board_reset_pin();
+void line_poll(void) {
+  if (master < 0) {
+    return;
+  }
+  struct pollfd port = {.fd = master, .events = POLLIN};
+  poll(&port, 1, 0);
+  bool open_now = !(port.revents & POLLHUP);
+  if (open_now && !host_open) {
+    host_open = true;
+    dtr_low = false;
+    poll_baud();
+    event("uart-open", "\"baud\":%u", host_baud);
+    board_reset_pin();
+  }
+  if (host_open && board_now() >= next_baud_poll) {
+    poll_baud();
+    next_baud_poll = board_now() + 1000 * TICKS_PER_US;
+  }
+  while (port.revents & POLLIN && rx_count < RX_ROOM) {
+    uint8_t bytes[RX_ROOM];
+    ssize_t got = read(master, bytes, RX_ROOM - rx_count);
+    if (got <= 0) {
+      break;
     }
-    if (host_open && board_now() >= next_baud_poll) {
-        poll_baud();
-        next_baud_poll = board_now() + 1000 * TICKS_PER_US;
+    line_counters.from_host += (uint64_t)got;
+    if (!board_runs_firmware()) {
+      line_counters.rx_bootloader += (uint64_t)got;
     }
-    while (port.revents & POLLIN && rx_count < RX_ROOM) {
-        uint8_t bytes[RX_ROOM];
-        ssize_t got = read(master, bytes, RX_ROOM - rx_count);
-        if (got <= 0)
-            break;
-        line_counters.from_host += (uint64_t)got;
-        if (!board_runs_firmware())
-            line_counters.rx_bootloader += (uint64_t)got;
-        for (ssize_t i = 0; i < got; i++)
-            rx[(rx_first + rx_count++) % RX_ROOM] = bytes[i];
+    for (ssize_t i = 0; i < got; i++) {
+      rx[(rx_first + rx_count++) % RX_ROOM] = bytes[i];
     }
-    if (!open_now && host_open) { /* after the read: what was written before the close still arrives */
-        host_open = false;
-        event("uart-close", "\"unplugged\":false");
-    }
+  }
+  if (!open_now && host_open) { /* after the read: what was written before the close still arrives */
+    host_open = false;
+    event("uart-close", "\"unplugged\":false");
+  }
 }
 
-ticks_t line_byte_ticks(void)
-{
-    return (ticks_t)TICKS_PER_SECOND * BITS_PER_BYTE / host_baud;
-}
+ticks_t line_byte_ticks(void) { return (ticks_t)TICKS_PER_SECOND * BITS_PER_BYTE / host_baud; }
 
-static bool rates_differ(uint32_t board_baud)
-{
-    double difference = (double)host_baud - board_baud;
-    if (!board_baud || (difference < 0 ? -difference : difference) <= BAUD_TOLERANCE * board_baud)
-        return false;
-    if (!wrong_baud_reported)
-        event("wrong-baud", "\"host\":%u,\"board\":%u", host_baud, board_baud);
-    wrong_baud_reported = true;
-    line_counters.wrong_baud++;
-    return true;
-}
-
-int line_next_byte(uint32_t board_baud)
-{
-    uint8_t byte;
-    if (board_now() < flood_until || chance(insert_rx)) {
-        byte = random_u32();
-    } else {
-        do {
-            if (rx_count == 0)
-                return -1;
-            byte = rx[rx_first];
-            rx_first = (rx_first + 1) % RX_ROOM;
-            rx_count--;
-        } while (chance(drop_rx) && ++line_counters.rx_dropped);
-        if (chance(corrupt_rx)) {
-            byte ^= 1u << (random_u32() % 8);
-            line_counters.rx_corrupted++;
-        }
-        if (rates_differ(board_baud))
-            byte = random_u32();
-    }
-    line_counters.rx++;
-    return byte;
-}
-
-void line_flood(ticks_t duration)
-{
-    flood_until = board_now() + duration;
-}
-
-void line_send(ticks_t end, uint8_t byte, uint32_t board_baud)
-{
-    line_counters.tx++;
-    if (!host_open)
-        return;
-    if (chance(drop_tx)) {
-        line_counters.tx_dropped++;
-        return;
-    }
-    if (chance(corrupt_tx)) {
-        byte ^= 1u << (random_u32() % 8);
-        line_counters.tx_corrupted++;
-    }
-    if (rates_differ(board_baud))
-        byte = random_u32();
-    if (tx_count == TX_ROOM) {
-        line_counters.tx_unread++;
-        return;
-    }
-    size_t last = (tx_first + tx_count++) % TX_ROOM;
-    tx[last].end = end;
-    tx[last].byte = byte;
-}
-
-void line_flush(ticks_t now)
-{
-    uint8_t bytes[TX_ROOM];
-    size_t count = 0;
-    while (tx_count && tx[tx_first].end <= now) {
-        bytes[count++] = tx[tx_first].byte;
-        tx_first = (tx_first + 1) % TX_ROOM;
-        tx_count--;
-    }
-    if (!count || master < 0 || !host_open)
-        return;
-    ssize_t written = write(master, bytes, count);
-    line_counters.to_host += written > 0 ? (size_t)written : 0;
-    line_counters.tx_unread += count - (written > 0 ? (size_t)written : 0);
-}
-
-bool line_command(const char *verb, double probability)
-{
-    struct { const char *verb; double *value; } noise[] = {
-        {"corrupt-rx", &corrupt_rx}, {"drop-rx", &drop_rx}, {"insert-rx", &insert_rx},
-        {"corrupt-tx", &corrupt_tx}, {"drop-tx", &drop_tx},
-    };
-    for (size_t i = 0; i < sizeof noise / sizeof *noise; i++)
-        if (!strcmp(verb, noise[i].verb)) {
-            *noise[i].value = probability;
-            return true;
-        }
+static bool rates_differ(uint32_t board_baud) {
+  double difference = (double)host_baud - board_baud;
+  if (!board_baud || (difference < 0 ? -difference : difference) <= BAUD_TOLERANCE * board_baud) {
     return false;
+  }
+  if (!wrong_baud_reported) {
+    event("wrong-baud", "\"host\":%u,\"board\":%u", host_baud, board_baud);
+  }
+  wrong_baud_reported = true;
+  line_counters.wrong_baud++;
+  return true;
+}
+
+int line_next_byte(uint32_t board_baud) {
+  uint8_t byte;
+  if (board_now() < flood_until || chance(insert_rx)) {
+    byte = random_u32();
+  } else {
+    do {
+      if (rx_count == 0) {
+        return -1;
+      }
+      byte = rx[rx_first];
+      rx_first = (rx_first + 1) % RX_ROOM;
+      rx_count--;
+    } while (chance(drop_rx) && ++line_counters.rx_dropped);
+    if (chance(corrupt_rx)) {
+      byte ^= 1u << (random_u32() % 8);
+      line_counters.rx_corrupted++;
+    }
+    if (rates_differ(board_baud)) {
+      byte = random_u32();
+    }
+  }
+  line_counters.rx++;
+  return byte;
+}
+
+void line_flood(ticks_t duration) { flood_until = board_now() + duration; }
+
+void line_send(ticks_t end, uint8_t byte, uint32_t board_baud) {
+  line_counters.tx++;
+  if (!host_open) {
+    return;
+  }
+  if (chance(drop_tx)) {
+    line_counters.tx_dropped++;
+    return;
+  }
+  if (chance(corrupt_tx)) {
+    byte ^= 1u << (random_u32() % 8);
+    line_counters.tx_corrupted++;
+  }
+  if (rates_differ(board_baud)) {
+    byte = random_u32();
+  }
+  if (tx_count == TX_ROOM) {
+    line_counters.tx_unread++;
+    return;
+  }
+  size_t last = (tx_first + tx_count++) % TX_ROOM;
+  tx[last].end = end;
+  tx[last].byte = byte;
+}
+
+void line_flush(ticks_t now) {
+  uint8_t bytes[TX_ROOM];
+  size_t count = 0;
+  while (tx_count && tx[tx_first].end <= now) {
+    bytes[count++] = tx[tx_first].byte;
+    tx_first = (tx_first + 1) % TX_ROOM;
+    tx_count--;
+  }
+  if (!count || master < 0 || !host_open) {
+    return;
+  }
+  ssize_t written = write(master, bytes, count);
+  line_counters.to_host += written > 0 ? (size_t)written : 0;
+  line_counters.tx_unread += count - (written > 0 ? (size_t)written : 0);
+}
+
+bool line_command(const char *verb, double probability) {
+  struct {
+    const char *verb;
+    double *value;
+  } noise[] = {
+      {"corrupt-rx", &corrupt_rx}, {"drop-rx", &drop_rx}, {"insert-rx", &insert_rx},
+      {"corrupt-tx", &corrupt_tx}, {"drop-tx", &drop_tx},
+  };
+  for (size_t i = 0; i < sizeof noise / sizeof *noise; i++) {
+    if (!strcmp(verb, noise[i].verb)) {
+      *noise[i].value = probability;
+      return true;
+    }
+  }
+  return false;
 }

@@ -1,4 +1,4 @@
-/* The parts of the emulated MEGA, for each other: board.c the chip, board_outputs.c its valve pins, board_uart.c UART0. */
+/* Shared by the parts of the emulated MEGA: board.c (chip), board_outputs.c (valve pins), board_uart.c (UART0). */
 #ifndef MEGA_H
 #define MEGA_H
 
@@ -19,10 +19,7 @@
 
 extern avr_t *avr;
 
-static inline unsigned word_at(unsigned address)
-{
-    return avr->data[address] | avr->data[address + 1] << 8;
-}
+static inline unsigned word_at(unsigned address) { return avr->data[address] | avr->data[address + 1] << 8; }
 
 void outputs_begin(void);
 void outputs_sample(void); /* reports what has changed */

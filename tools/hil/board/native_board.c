@@ -11,7 +11,7 @@
 #include "limits.h"
 #include "pins.h"
 
-#define LOOP_TICKS (1000 * TICKS_PER_US)          /* firmware.ino sleeps for a millisecond at most */
+#define LOOP_TICKS (1000 * TICKS_PER_US)           /* firmware.ino sleeps for a millisecond at most */
 #define WATCHDOG_TICKS (128 * 1000 * TICKS_PER_US) /* WDTO_120MS is 16384 cycles of 128 kHz */
 #define TX_BUFFER 64
 #define ADC_COUNTS 1024
@@ -29,115 +29,112 @@ static bool hung;
 static unsigned counts_now[MAX_CHANNELS];
 static int16_t measured[PROTOCOL_CHANNELS];
 
-static uint32_t now_ms(void)
-{
-    return (uint32_t)((now - started) / LOOP_TICKS);
-}
+static uint32_t now_ms(void) { return (uint32_t)((now - started) / LOOP_TICKS); }
 
-static void start(uint8_t cause, const char *name)
-{
-    hung = false;
-    started = next_loop = watchdog_fed = now + STARTUP_TICKS;
-    tx_free = 0;
-    report_reset(name);
-    supervisor_init(&logic, boot_id, cause, 0);
-    for (unsigned channel = 0; channel < board_channels; channel++)
-        if (counts_now[channel])
-            report_duty(channel, counts_now[channel] = 0, 0, 0);
-}
-
-static void loop(void)
-{
-    uint8_t checks = supervisor_update(&logic, measured, ADC_FULL_MV, now_ms());
-    for (unsigned channel = 0; channel < board_channels; channel++) {
-        unsigned counts = supervisor_counts(&logic, channel);
-        if (counts == counts_now[channel])
-            continue;
-        counts_now[channel] = counts;
-        report_duty(channel, (double)counts / PWM_COUNTS, counts ? counts - 1 : 0, counts ? PWM_TOP : 0);
+static void start(uint8_t cause, const char *name) {
+  hung = false;
+  started = next_loop = watchdog_fed = now + STARTUP_TICKS;
+  tx_free = 0;
+  report_reset(name);
+  supervisor_init(&logic, boot_id, cause, 0);
+  for (unsigned channel = 0; channel < board_channels; channel++) {
+    if (counts_now[channel]) {
+      report_duty(channel, counts_now[channel] = 0, 0, 0);
     }
-    ticks_t byte_ticks = (ticks_t)TICKS_PER_SECOND * 10 / BAUD;
-    while (tx_free < now + TX_BUFFER * byte_ticks) {
-        int16_t byte = supervisor_next_byte(&logic);
-        if (byte < 0)
-            break;
-        tx_free = (tx_free > now ? tx_free : now) + byte_ticks;
-        line_send(tx_free, (uint8_t)byte, BAUD);
+  }
+}
+
+static void loop(void) {
+  uint8_t checks = supervisor_update(&logic, measured, ADC_FULL_MV, now_ms());
+  for (unsigned channel = 0; channel < board_channels; channel++) {
+    unsigned counts = supervisor_counts(&logic, channel);
+    if (counts == counts_now[channel]) {
+      continue;
     }
-    if (checks == CHECK_ALL)
-        watchdog_fed = now;
-}
-
-void board_run(ticks_t until)
-{
-    while (now < until) {
-        if (rx_now < 0 && (rx_now = line_next_byte(BAUD)) >= 0)
-            rx_end = now + line_byte_ticks();
-        ticks_t watchdog = watchdog_fed + WATCHDOG_TICKS, next = until;
-        if (rx_now >= 0 && rx_end < next)
-            next = rx_end;
-        if (!hung && next_loop < next)
-            next = next_loop;
-        if (watchdog < next)
-            next = watchdog;
-        now = next > now ? next : now;
-        bool arrived = rx_now >= 0 && now >= rx_end, listens = !hung && now >= started;
-        if (arrived && listens)
-            supervisor_receive(&logic, (uint8_t)rx_now, now_ms());
-        if (arrived)
-            rx_now = -1;
-        if (listens && (arrived || now >= next_loop)) {
-            loop();
-            next_loop = now + LOOP_TICKS;
-        }
-        if (now >= watchdog_fed + WATCHDOG_TICKS) {
-            boot_id++;
-            start(RESET_CAUSE_WATCHDOG, "watchdog");
-        }
+    counts_now[channel] = counts;
+    report_duty(channel, (double)counts / PWM_COUNTS, counts ? counts - 1 : 0, counts ? PWM_TOP : 0);
+  }
+  ticks_t byte_ticks = (ticks_t)TICKS_PER_SECOND * 10 / BAUD;
+  while (tx_free < now + TX_BUFFER * byte_ticks) {
+    int16_t byte = supervisor_next_byte(&logic);
+    if (byte < 0) {
+      break;
     }
+    tx_free = (tx_free > now ? tx_free : now) + byte_ticks;
+    line_send(tx_free, (uint8_t)byte, BAUD);
+  }
+  if (checks == CHECK_ALL) {
+    watchdog_fed = now;
+  }
 }
 
-void board_reset_pin(void)
-{
-    boot_id++;
-    start(RESET_CAUSE_EXTERNAL, "external");
+void board_run(ticks_t until) {
+  while (now < until) {
+    if (rx_now < 0 && (rx_now = line_next_byte(BAUD)) >= 0) {
+      rx_end = now + line_byte_ticks();
+    }
+    ticks_t watchdog = watchdog_fed + WATCHDOG_TICKS, next = until;
+    if (rx_now >= 0 && rx_end < next) {
+      next = rx_end;
+    }
+    if (!hung && next_loop < next) {
+      next = next_loop;
+    }
+    if (watchdog < next) {
+      next = watchdog;
+    }
+    now = next > now ? next : now;
+    bool arrived = rx_now >= 0 && now >= rx_end, listens = !hung && now >= started;
+    if (arrived && listens) {
+      supervisor_receive(&logic, (uint8_t)rx_now, now_ms());
+    }
+    if (arrived) {
+      rx_now = -1;
+    }
+    if (listens && (arrived || now >= next_loop)) {
+      loop();
+      next_loop = now + LOOP_TICKS;
+    }
+    if (now >= watchdog_fed + WATCHDOG_TICKS) {
+      boot_id++;
+      start(RESET_CAUSE_WATCHDOG, "watchdog");
+    }
+  }
 }
 
-void board_power_cycle(void)
-{
-    boot_id = random_u32();
-    start(RESET_CAUSE_POWER_ON, "power-on");
+void board_reset_pin(void) {
+  boot_id++;
+  start(RESET_CAUSE_EXTERNAL, "external");
 }
 
-void board_power_on(const struct options *options)
-{
-    if (options->bootloader)
-        fail(EXIT_USAGE, "the native board has no bootloader: leave --bootloader out");
-    for (unsigned channel = 0; channel < PROTOCOL_CHANNELS; channel++)
-        measured[channel] = channel < ADC_CHANNELS && (SENSORS >> channel & 1) ? 0 : PROTOCOL_NOT_MEASURED;
-    board_power_cycle();
+void board_power_cycle(void) {
+  boot_id = random_u32();
+  start(RESET_CAUSE_POWER_ON, "power-on");
 }
 
-bool board_runs_firmware(void)
-{
-    return now >= started;
+void board_power_on(const struct options *options) {
+  if (options->bootloader) {
+    fail(EXIT_USAGE, "the native board has no bootloader: leave --bootloader out");
+  }
+  for (unsigned channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
+    measured[channel] = channel < ADC_CHANNELS && (SENSORS >> channel & 1) ? 0 : PROTOCOL_NOT_MEASURED;
+  }
+  board_power_cycle();
 }
 
-bool board_hang(bool deaf)
-{
-    (void)deaf; /* there are no interrupts here */
-    hung = true;
-    event("hang", "%s", "");
-    return true;
+bool board_runs_firmware(void) { return now >= started; }
+
+bool board_hang(bool deaf) {
+  (void)deaf; /* there are no interrupts here */
+  hung = true;
+  event("hang", "%s", "");
+  return true;
 }
 
-ticks_t board_now(void)
-{
-    return now;
-}
+ticks_t board_now(void) { return now; }
 
-void board_set_adc(unsigned input, unsigned millivolt)
-{
-    if (SENSORS >> input & 1)
-        measured[input] = (int16_t)(millivolt * (ADC_COUNTS - 1) / ADC_FULL_MV * (uint32_t)SENSOR_FULL / ADC_COUNTS);
+void board_set_adc(unsigned input, unsigned millivolt) {
+  if (SENSORS >> input & 1) {
+    measured[input] = (int16_t)(millivolt * (ADC_COUNTS - 1) / ADC_FULL_MV * (uint32_t)SENSOR_FULL / ADC_COUNTS);
+  }
 }
