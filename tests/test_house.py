@@ -54,6 +54,17 @@ def test_style_of_c():
     assert [path.name for path in C_SOURCES if max(map(len, path.read_text().splitlines())) > 120] == []
 
 
+def test_c_files_and_functions_are_short_or_give_a_reason():
+    for path in C_SOURCES:
+        lines = path.read_text().splitlines()
+        assert len(lines) <= 300 or "More than 300 lines" in "\n".join(lines[:30]), path
+        started = 0  # the style puts the first line of a function, and its last brace, at the left edge
+        for number, line in enumerate(lines):
+            if line[:1].isalpha():
+                started = number
+            assert line != "}" or number - started < 60, f"{path}:{started + 1}: longer than 60 lines"
+
+
 def test_firmware_header_is_generated_from_the_protocol():
     subprocess.run([sys.executable, "tools/gen_protocol.py", "--check"], cwd=ROOT, check=True)
 

@@ -86,7 +86,7 @@ static void enter_reset(const char *cause) {
     memcpy(avr->flash + hang.at, hang.before, 2);
     hang.on = false;
   }
-  report_reset(cause);
+  harness_report_reset(cause);
   outputs_sample();
 }
 
@@ -123,7 +123,7 @@ void board_power_cycle(void) {
   for (unsigned address = 0; address <= avr->ramend;
        address++) { /* chance values; every other reset leaves them alone */
     if (address < 32 || address > avr->ioend) {
-      avr->data[address] = random_u32();
+      avr->data[address] = harness_random();
     }
   }
   enter_reset("power-on");
@@ -143,7 +143,7 @@ bool board_hang(bool deaf) {
   if (deaf) {
     avr->sreg[S_I] = 0;
   }
-  event("hang", "\"pc\":%u,\"interrupts\":%s", (unsigned)avr->pc, deaf ? "false" : "true");
+  events_emit("hang", "\"pc\":%u,\"interrupts\":%s", (unsigned)avr->pc, deaf ? "false" : "true");
   return true;
 }
 
@@ -170,7 +170,8 @@ void board_run(ticks_t until) {
     }
     if (avr->state == cpu_Done || avr->state == cpu_Crashed) { /* asleep with interrupts off, or lost: time goes on */
       if (!halted_reported) {
-        event("halted", "\"pc\":%u,\"crashed\":%s", (unsigned)avr->pc, avr->state == cpu_Crashed ? "true" : "false");
+        events_emit("halted", "\"pc\":%u,\"crashed\":%s", (unsigned)avr->pc,
+                    avr->state == cpu_Crashed ? "true" : "false");
       }
       halted_reported = true;
       avr->cycle += TICKS_PER_US;
@@ -190,7 +191,7 @@ static uint32_t load_hex(const char *path) {
   ihex_chunk_p chunks = NULL;
   int count = read_ihex_chunks(path, &chunks);
   if (count <= 0) {
-    fail(EXIT_USAGE, "%s is not an Intel hex file that can be read", path);
+    events_fail(EXIT_USAGE, "%s is not an Intel hex file that can be read", path);
   }
   for (int i = 0; i < count; i++) {
     avr_loadcode(avr, chunks[i].data, chunks[i].size, chunks[i].baseaddr);
@@ -204,7 +205,7 @@ static void load_firmware(const char *path) {
   if (suffix && !strcasecmp(suffix, ".hex")) {
     load_hex(path);
   } else if (elf_read_firmware(path, &firmware) != 0 || !firmware.flashsize) {
-    fail(EXIT_USAGE, "%s is not a firmware ELF file that can be read", path);
+    events_fail(EXIT_USAGE, "%s is not a firmware ELF file that can be read", path);
   } else {
     avr_loadcode(avr, firmware.flash, firmware.flashsize, firmware.flashbase);
   }
@@ -229,12 +230,12 @@ static void on_sleep(avr_t *chip, avr_cycle_count_t cycles) {
 
 void board_power_on(const struct options *options) {
   if (!options->firmware) {
-    fail(EXIT_USAGE, "--elf FILE is missing: the firmware to run");
+    events_fail(EXIT_USAGE, "--elf FILE is missing: the firmware to run");
   }
   avr_global_logger_set(log_to_stderr);
   avr = avr_make_mcu_by_name("atmega2560");
   if (!avr) {
-    fail(EXIT_INTERNAL, "this simavr has no ATmega2560");
+    events_fail(EXIT_INTERNAL, "this simavr has no ATmega2560");
   }
   avr_init(avr);
   avr->frequency = TICKS_PER_SECOND;

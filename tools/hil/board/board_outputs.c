@@ -56,7 +56,7 @@ static void sample(unsigned channel) {
   last[channel].duty = duty;
   last[channel].compare = compare;
   last[channel].top = top;
-  report_duty(channel, duty, compare, top);
+  harness_report_duty(channel, duty, compare, top);
 }
 
 void outputs_sample(void) {
@@ -95,7 +95,7 @@ void outputs_begin(void) {
       o++;
     }
     if (o == OUTPUTS) {
-      fail(EXIT_INTERNAL, "pin %u of channel %u is no 16-bit timer output", channel_pins[channel], channel);
+      events_fail(EXIT_INTERNAL, "pin %u of channel %u is no 16-bit timer output", channel_pins[channel], channel);
     }
     output_of[channel] = o;
     watch(outputs[o].compare); /* the low byte: its write comes last */

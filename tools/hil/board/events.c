@@ -18,7 +18,7 @@ static int events_fd;
 static char *pending;
 static size_t pending_size, pending_room;
 
-uint64_t mono_ns(void) {
+uint64_t events_mono_ns(void) {
   struct timespec now;
   clock_gettime(CLOCK_MONOTONIC, &now);
   return (uint64_t)now.tv_sec * 1000000000u + (uint64_t)now.tv_nsec;
@@ -30,7 +30,7 @@ void events_begin(void) {
   fcntl(events_fd, F_SETFL, fcntl(events_fd, F_GETFL) | O_NONBLOCK);
 }
 
-void fail(int exit_code, const char *format, ...) {
+void events_fail(int exit_code, const char *format, ...) {
   va_list arguments;
   va_start(arguments, format);
   fprintf(stderr, "board: ");
@@ -41,7 +41,7 @@ void fail(int exit_code, const char *format, ...) {
 }
 
 /* Writes the waiting events without blocking: a slow reader must not delay emulated time, and no event is dropped. */
-void flush_events(bool wait) {
+void events_flush(bool wait) {
   size_t done = 0;
   while (done < pending_size) {
     ssize_t written = write(events_fd, pending + done, pending_size - done);
@@ -58,12 +58,12 @@ void flush_events(bool wait) {
   memmove(pending, pending + done, pending_size -= done);
 }
 
-void event(const char *name, const char *format, ...) {
+void events_emit(const char *name, const char *format, ...) {
   char line[2048];
   ticks_t now = board_now();
   int size = snprintf(line, sizeof line, "{\"t_us\":%llu.%04u,\"mono_ns\":%llu,\"event\":\"%s\"",
                       (unsigned long long)(now / TICKS_PER_US), (unsigned)(now % TICKS_PER_US) * (10000 / TICKS_PER_US),
-                      (unsigned long long)mono_ns(), name);
+                      (unsigned long long)events_mono_ns(), name);
   va_list arguments;
   va_start(arguments, format);
   int members = vsnprintf(line + size + 1, sizeof line - size - 4, format, arguments);
@@ -75,7 +75,7 @@ void event(const char *name, const char *format, ...) {
   line[size++] = '}';
   line[size++] = '\n';
   if (pending_size + size > EVENT_BACKLOG) {
-    fail(EXIT_INTERNAL, "nobody reads the events: %zu bytes are waiting", pending_size);
+    events_fail(EXIT_INTERNAL, "nobody reads the events: %zu bytes are waiting", pending_size);
   }
   if (pending_size + size > pending_room) {
     pending = realloc(pending, pending_room = 2 * pending_room + sizeof line);

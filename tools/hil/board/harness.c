@@ -4,7 +4,6 @@
 
 #include <errno.h>
 #include <getopt.h>
-#include <math.h>
 #include <poll.h>
 #include <signal.h>
 #include <stdio.h>
@@ -17,10 +16,6 @@
 #include "limits.h"
 #include "pins.h"
 
-#define SENSOR_FULL_MV 5000
-#define SENSOR_MV_PER_UNIT ((double)SENSOR_FULL_MV / SENSOR_FULL) /* a unit is that of limits.h, 10 Pa */
-#define UNITS_PER_BAR (100000 / PROTOCOL_PRESSURE_UNIT_PA)
-
 #define SLICE_US 500
 #define LATE_US 1000        /* a slice later than this is counted */
 #define LATE_BOUND_US 20000 /* later than this, emulated time gives way instead of running after real time */
@@ -28,39 +23,31 @@
 #define STEP_TRIES 20000
 
 static uint64_t started_ns, slices, late_slices, max_late_ns, slipped_ns, pwm_events, resets;
-static double duty_now[MAX_CHANNELS];
-static struct {
-  bool follows;
-  double level_mv;
-  unsigned sent_mv;
-} sensor[ADC_CHANNELS];
-static double sensor_tau_us;
 static ticks_t run_until;      /* stepped: emulated time stands still from here on */
 static uint64_t run_from_host; /* ... and does not start before so many bytes came from the host */
 static bool run_told = true;
 static volatile sig_atomic_t stop_signal;
-static pid_t parent;
 static uint64_t random_state = 0x9E3779B97F4A7C15u;
 
-uint32_t random_u32(void) {
+uint32_t harness_random(void) {
   random_state ^= random_state << 13; /* xorshift64 */
   random_state ^= random_state >> 7;
   random_state ^= random_state << 17;
   return random_state >> 32;
 }
 
-void report_duty(unsigned channel, double duty, unsigned compare, unsigned top) {
-  duty_now[channel] = duty;
+void harness_report_duty(unsigned channel, double duty, unsigned compare, unsigned top) {
+  sensors_on_duty(channel, duty);
   pwm_events++;
-  event("pwm", "\"channel\":%u,\"duty\":%.6f,\"raw\":[%u,%u]", channel, duty, compare, top);
+  events_emit("pwm", "\"channel\":%u,\"duty\":%.6f,\"raw\":[%u,%u]", channel, duty, compare, top);
 }
 
-void report_reset(const char *cause) {
+void harness_report_reset(const char *cause) {
   resets++;
   if (!strcmp(cause, "watchdog")) {
-    event("watchdog", "%s", "");
+    events_emit("watchdog", "%s", "");
   }
-  event("reset", "\"cause\":\"%s\"", cause);
+  events_emit("reset", "\"cause\":\"%s\"", cause);
 }
 
 static void report_statistics(const char *name) {
@@ -68,38 +55,24 @@ static void report_statistics(const char *name) {
   getrusage(RUSAGE_SELF, &usage);
   double cpu_s =
       usage.ru_utime.tv_sec + usage.ru_stime.tv_sec + 1e-6 * (usage.ru_utime.tv_usec + usage.ru_stime.tv_usec);
-  double wall_s = 1e-9 * (mono_ns() - started_ns), emulated_s = (double)board_now() / TICKS_PER_SECOND;
+  double wall_s = 1e-9 * (events_mono_ns() - started_ns), emulated_s = (double)board_now() / TICKS_PER_SECOND;
   struct line_counters *c = &line_counters;
-  event(name,
-        "\"emulated_s\":%.6f,\"wall_s\":%.6f,\"cpu_s\":%.3f,\"percent_of_real_time\":%.3f,\"percent_of_core\":%.2f,"
-        "\"slices\":%llu,\"late_slices\":%llu,\"max_late_us\":%.1f,\"slipped_us\":%.1f,"
-        "\"pwm_events\":%llu,\"resets\":%llu,"
-        "\"firmware_slept_us\":%.1f,\"firmware_max_awake_us\":%.1f,"
-        "\"rx\":%llu,\"tx\":%llu,\"rx_bootloader\":%llu,\"rx_overrun\":%llu,\"tx_unread\":%llu,"
-        "\"rx_corrupted\":%llu,\"rx_dropped\":%llu,"
-        "\"tx_corrupted\":%llu,\"tx_dropped\":%llu,\"wrong_baud\":%llu",
-        emulated_s, wall_s, cpu_s, wall_s > 0 ? 100 * emulated_s / wall_s : 0, wall_s > 0 ? 100 * cpu_s / wall_s : 0,
-        (unsigned long long)slices, (unsigned long long)late_slices, max_late_ns * 1e-3, slipped_ns * 1e-3,
-        (unsigned long long)pwm_events, (unsigned long long)resets, (double)board_load.slept / TICKS_PER_US,
-        (double)board_load.max_awake / TICKS_PER_US, (unsigned long long)c->rx, (unsigned long long)c->tx,
-        (unsigned long long)c->rx_bootloader, (unsigned long long)c->rx_overrun, (unsigned long long)c->tx_unread,
-        (unsigned long long)c->rx_corrupted, (unsigned long long)c->rx_dropped, (unsigned long long)c->tx_corrupted,
-        (unsigned long long)c->tx_dropped, (unsigned long long)c->wrong_baud);
-}
-
-/* Pressure sensors that follow their valves with a first-order lag in emulated time, without the host. */
-static void run_sensors(double elapsed_us) {
-  for (unsigned input = 0; input < ADC_CHANNELS; input++) {
-    if (!sensor[input].follows) {
-      continue;
-    }
-    double target_mv = duty_now[input] * P_FULL * SENSOR_MV_PER_UNIT;
-    sensor[input].level_mv += (target_mv - sensor[input].level_mv) * -expm1(-elapsed_us / sensor_tau_us);
-    unsigned level_mv = (unsigned)fmin(sensor[input].level_mv + 0.5, SENSOR_FULL_MV);
-    if (level_mv != sensor[input].sent_mv) {
-      board_set_adc(input, sensor[input].sent_mv = level_mv);
-    }
-  }
+  events_emit(
+      name,
+      "\"emulated_s\":%.6f,\"wall_s\":%.6f,\"cpu_s\":%.3f,\"percent_of_real_time\":%.3f,\"percent_of_core\":%.2f,"
+      "\"slices\":%llu,\"late_slices\":%llu,\"max_late_us\":%.1f,\"slipped_us\":%.1f,"
+      "\"pwm_events\":%llu,\"resets\":%llu,"
+      "\"firmware_slept_us\":%.1f,\"firmware_max_awake_us\":%.1f,"
+      "\"rx\":%llu,\"tx\":%llu,\"rx_bootloader\":%llu,\"rx_overrun\":%llu,\"tx_unread\":%llu,"
+      "\"rx_corrupted\":%llu,\"rx_dropped\":%llu,"
+      "\"tx_corrupted\":%llu,\"tx_dropped\":%llu,\"wrong_baud\":%llu",
+      emulated_s, wall_s, cpu_s, wall_s > 0 ? 100 * emulated_s / wall_s : 0, wall_s > 0 ? 100 * cpu_s / wall_s : 0,
+      (unsigned long long)slices, (unsigned long long)late_slices, max_late_ns * 1e-3, slipped_ns * 1e-3,
+      (unsigned long long)pwm_events, (unsigned long long)resets, (double)board_load.slept / TICKS_PER_US,
+      (double)board_load.max_awake / TICKS_PER_US, (unsigned long long)c->rx, (unsigned long long)c->tx,
+      (unsigned long long)c->rx_bootloader, (unsigned long long)c->rx_overrun, (unsigned long long)c->tx_unread,
+      (unsigned long long)c->rx_corrupted, (unsigned long long)c->rx_dropped, (unsigned long long)c->tx_corrupted,
+      (unsigned long long)c->tx_dropped, (unsigned long long)c->wrong_baud);
 }
 
 static bool run_command(char *line) {
@@ -111,15 +84,10 @@ static bool run_command(char *line) {
   if (!strcmp(verb, "quit")) {
     stop_signal = SIGTERM;
   } else if (!strcmp(verb, "adc") && numbers == 2 && a >= 0 && a < ADC_CHANNELS && b >= 0 && b <= SENSOR_FULL_MV) {
-    sensor[(unsigned)a].follows = false;
-    board_set_adc((unsigned)a, (unsigned)b);
+    sensors_hold((unsigned)a, (unsigned)b);
     return true; /* a rig sends hundreds a second: no event */
   } else if (!strcmp(verb, "sensors") && numbers == 1 && a > 0) {
-    sensor_tau_us = 1000 * a;
-    for (unsigned input = 0; input < ADC_CHANNELS; input++) {
-      sensor[input].follows = SENSORS >> input & 1;
-      sensor[input].sent_mv = ~0u;
-    }
+    sensors_follow(a);
   } else if (!strcmp(verb, "reset")) {
     board_reset_pin();
   } else if (!strcmp(verb, "power-cycle")) {
@@ -152,7 +120,7 @@ static bool run_command(char *line) {
       *p = '?';
     }
   }
-  event("command", "\"done\":%s,\"line\":\"%.200s\"", known ? "true" : "false", line);
+  events_emit("command", "\"done\":%s,\"line\":\"%.200s\"", known ? "true" : "false", line);
   return known;
 }
 
@@ -190,7 +158,7 @@ static void pace(uint64_t *base_ns, ticks_t slice_end) {
   struct timespec due = {.tv_sec = (time_t)(due_ns / 1000000000u), .tv_nsec = (long)(due_ns % 1000000000u)};
   while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL) == EINTR && !stop_signal) {
   }
-  now_ns = mono_ns();
+  now_ns = events_mono_ns();
   uint64_t late_ns = now_ns > due_ns ? now_ns - due_ns : 0;
   late_slices += late_ns > LATE_US * 1000u;
   if (late_ns > max_late_ns) {
@@ -199,7 +167,7 @@ static void pace(uint64_t *base_ns, ticks_t slice_end) {
   if (late_ns > LATE_BOUND_US * 1000u) {
     *base_ns += late_ns;
     slipped_ns += late_ns;
-    event("late", "\"late_us\":%.1f", late_ns * 1e-3);
+    events_emit("late", "\"late_us\":%.1f", late_ns * 1e-3);
   }
 }
 
@@ -207,11 +175,11 @@ static void pace(uint64_t *base_ns, ticks_t slice_end) {
 static void await_step(void) {
   while (board_now() >= run_until && !stop_signal) {
     if (!run_told) {
-      event("ran", "\"from_host\":%llu,\"to_host\":%llu", (unsigned long long)line_counters.from_host,
-            (unsigned long long)line_counters.to_host);
+      events_emit("ran", "\"from_host\":%llu,\"to_host\":%llu", (unsigned long long)line_counters.from_host,
+                  (unsigned long long)line_counters.to_host);
     }
     run_told = true;
-    flush_events(true);
+    events_flush(true);
     read_commands(1000);
   }
   line_poll();
@@ -221,7 +189,7 @@ static void await_step(void) {
   }
 }
 
-int main(int argc, char **argv) {
+static struct options parse_options(int argc, char **argv) {
   struct options options = {0};
   static const struct option names[] = {
       {"elf", required_argument, NULL, 'e'},
@@ -250,60 +218,73 @@ int main(int argc, char **argv) {
         options.stepped = true;
         break;
       default:
-        return EXIT_USAGE;
+        exit(EXIT_USAGE);
     }
   }
   if (!options.port_link) {
-    fail(EXIT_USAGE, "--port-link PATH is missing: where to put the link to the serial port");
+    events_fail(EXIT_USAGE, "--port-link PATH is missing: where to put the link to the serial port");
   }
+  return options;
+}
 
+static void report_ready(const struct options *options) {
+  events_emit("ready",
+              "\"board\":\"%s\",\"clock\":\"%s\",\"port\":\"%s\",\"channels\":%u,\"bootloader\":%s,\"pid\":%d,"
+              "\"p_full_bar\":%g,\"sensors\":%u,\"sensor_mv_per_bar\":%g",
+              board_name,
+              options->stepped ? "emulated, step by step"
+              : options->fast  ? "emulated, not held to real time"
+                               : "emulated, held to real time",
+              line_port(), board_channels, options->bootloader ? "true" : "false", (int)getpid(),
+              (double)P_FULL / UNITS_PER_BAR, (unsigned)SENSORS, SENSOR_MV_PER_UNIT * UNITS_PER_BAR);
+}
+
+/* Runs the board for one slice of emulated time. */
+static void run_slice(const struct options *options, uint64_t *base_ns) {
+  if (options->stepped) {
+    await_step();
+  }
+  ticks_t slice_end = board_now() + SLICE_US * TICKS_PER_US;
+  if (options->stepped && run_until < slice_end) {
+    slice_end = run_until;
+  }
+  if (!options->fast && !options->stepped) {
+    pace(base_ns, slice_end);
+  }
+  if (!options->stepped) {
+    read_commands(0);
+  }
+  line_poll();
+  ticks_t before = board_now();
+  board_run(slice_end);
+  sensors_advance((double)(board_now() - before) / TICKS_PER_US);
+  line_flush(board_now());
+  events_flush(false);
+}
+
+int main(int argc, char **argv) {
+  struct options options = parse_options(argc, argv);
   events_begin();
   signal(SIGPIPE, SIG_IGN);
   signal(SIGINT, on_signal);
   signal(SIGTERM, on_signal);
   signal(SIGHUP, on_signal);
-  parent = getppid();
+  pid_t parent = getppid();
 
   board_power_on(&options);
   line_open(options.port_link);
-  started_ns = mono_ns();
-  event("ready",
-        "\"board\":\"%s\",\"clock\":\"%s\",\"port\":\"%s\",\"channels\":%u,\"bootloader\":%s,\"pid\":%d,"
-        "\"p_full_bar\":%g,\"sensors\":%u,\"sensor_mv_per_bar\":%g",
-        board_name,
-        options.stepped ? "emulated, step by step"
-        : options.fast  ? "emulated, not held to real time"
-                        : "emulated, held to real time",
-        line_port(), board_channels, options.bootloader ? "true" : "false", (int)getpid(),
-        (double)P_FULL / UNITS_PER_BAR, (unsigned)SENSORS, SENSOR_MV_PER_UNIT * UNITS_PER_BAR);
+  started_ns = events_mono_ns();
+  report_ready(&options);
 
   uint64_t base_ns = started_ns - board_now() * 1000 / TICKS_PER_US;
   while (!stop_signal) {
-    if (options.stepped) {
-      await_step();
-    }
-    ticks_t slice_end = board_now() + SLICE_US * TICKS_PER_US;
-    if (options.stepped && run_until < slice_end) {
-      slice_end = run_until;
-    }
-    if (!options.fast && !options.stepped) {
-      pace(&base_ns, slice_end);
-    }
-    if (!options.stepped) {
-      read_commands(0);
-    }
-    line_poll();
-    ticks_t before = board_now();
-    board_run(slice_end);
-    run_sensors((double)(board_now() - before) / TICKS_PER_US);
-    line_flush(board_now());
-    flush_events(false);
+    run_slice(&options, &base_ns);
     if (++slices % 400 == 0 && getppid() != parent) {
-      break; /* the starter died; unlike PR_SET_PDEATHSIG this does not hang on the starting thread */
+      break; /* the parent died; PR_SET_PDEATHSIG would depend on the thread that started this process */
     }
   }
   line_unplug();
   report_statistics("summary");
-  flush_events(true);
+  events_flush(true);
   return 0;
 }

@@ -1,8 +1,8 @@
 /* What the two emulated boards share, and what each of them has to give.
  *
  * board.c (the compiled firmware on simavr) and native_board.c (the firmware's logic compiled for this machine) define
- * the board_* functions; line.c (the serial line as a pseudo terminal), events.c and harness.c (main, commands,
- * pacing) are the same for both. The commands and events are described at the top of board.c. */
+ * the board_* functions; line.c (serial line as a pseudo terminal), sensors.c, events.c and harness.c (main,
+ * commands, pacing) serve both. The commands and events are described at the top of board.c. */
 #ifndef HARNESS_H
 #define HARNESS_H
 
@@ -77,19 +77,30 @@ void line_send(ticks_t end, uint8_t byte, uint32_t board_baud);
 bool line_command(const char *verb, double probability);
 void line_flood(ticks_t duration);
 
+/* --- pressure sensors (sensors.c) -------------------------------------------------------------------------------- */
+
+#define SENSOR_FULL_MV 5000
+#define SENSOR_MV_PER_UNIT ((double)SENSOR_FULL_MV / SENSOR_FULL) /* a unit is that of limits.h, 10 Pa */
+#define UNITS_PER_BAR (100000 / PROTOCOL_PRESSURE_UNIT_PA)
+
+void sensors_follow(double tau_ms);                    /* every sensor follows its valve */
+void sensors_hold(unsigned input, unsigned millivolt); /* this one reads a fixed voltage */
+void sensors_on_duty(unsigned channel, double duty);   /* a valve changed */
+void sensors_advance(double elapsed_us);               /* once a slice */
+
 /* --- events (events.c) ------------------------------------------------------------------------------------------- */
 
 void events_begin(void);
-uint64_t mono_ns(void); /* CLOCK_MONOTONIC */
-void flush_events(bool wait);
-void event(const char *name, const char *format, ...) __attribute__((format(printf, 2, 3)));
-_Noreturn void fail(int exit_code, const char *format, ...) __attribute__((format(printf, 2, 3)));
+uint64_t events_mono_ns(void); /* CLOCK_MONOTONIC */
+void events_flush(bool wait);
+void events_emit(const char *name, const char *format, ...) __attribute__((format(printf, 2, 3)));
+_Noreturn void events_fail(int exit_code, const char *format, ...) __attribute__((format(printf, 2, 3)));
 
 /* --- outputs and random numbers (harness.c) ---------------------------------------------------------------------- */
 
-void report_duty(unsigned channel, double duty, unsigned compare, unsigned top);
-void report_reset(const char *cause);
-uint32_t random_u32(void);
+void harness_report_duty(unsigned channel, double duty, unsigned compare, unsigned top);
+void harness_report_reset(const char *cause);
+uint32_t harness_random(void);
 
 enum { EXIT_USAGE = 2, EXIT_INTERNAL = 70 };
 

@@ -41,7 +41,7 @@ static size_t tx_first, tx_count;
 
 static double corrupt_rx, drop_rx, insert_rx, corrupt_tx, drop_tx;
 
-static bool chance(double probability) { return probability > 0 && random_u32() < probability * 4294967296.0; }
+static bool chance(double probability) { return probability > 0 && harness_random() < probability * 4294967296.0; }
 
 static void make_link(const char *link) {
   struct stat there;
@@ -50,20 +50,20 @@ static void make_link(const char *link) {
     unlink(link_name); /* left behind by a board that was killed; anything else is not ours to remove */
   }
   if (symlink(slave_name, link_name) != 0) {
-    fail(EXIT_USAGE, "cannot make the port link %s: %s", link_name, strerror(errno));
+    events_fail(EXIT_USAGE, "cannot make the port link %s: %s", link_name, strerror(errno));
   }
 }
 
 void line_open(const char *link) {
   master = posix_openpt(O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
   if (master < 0 || grantpt(master) != 0 || unlockpt(master) != 0 || ptsname_r(master, slave_name, sizeof slave_name)) {
-    fail(EXIT_INTERNAL, "cannot make a pseudo terminal: %s", strerror(errno));
+    events_fail(EXIT_INTERNAL, "cannot make a pseudo terminal: %s", strerror(errno));
   }
   /* Opened once: it makes the line raw before the first host comes, and POLLHUP is only reported after a close. */
   int slave = open(slave_name, O_RDWR | O_NOCTTY | O_CLOEXEC);
   struct termios2 raw;
   if (slave < 0 || ioctl(slave, TCGETS2, &raw) != 0) {
-    fail(EXIT_INTERNAL, "cannot open the pseudo terminal %s: %s", slave_name, strerror(errno));
+    events_fail(EXIT_INTERNAL, "cannot open the pseudo terminal %s: %s", slave_name, strerror(errno));
   }
   raw.c_iflag = 0;
   raw.c_oflag = 0;
@@ -84,7 +84,7 @@ void line_unplug(void) {
   master = -1;
   rx_count = tx_count = 0;
   if (host_open) {
-    event("uart-close", "\"unplugged\":true");
+    events_emit("uart-close", "\"unplugged\":true");
   }
   host_open = false;
 }
@@ -119,7 +119,7 @@ static void poll_baud(void) {
     dtr_low = true;
   } else if (dtr_low) {
     dtr_low = false;
-    event("dtr-pulse", "\"baud\":%u", baud);
+    events_emit("dtr-pulse", "\"baud\":%u", baud);
     board_reset_pin();
   }
 }
@@ -135,7 +135,7 @@ void line_poll(void) {
     host_open = true;
     dtr_low = false;
     poll_baud();
-    event("uart-open", "\"baud\":%u", host_baud);
+    events_emit("uart-open", "\"baud\":%u", host_baud);
     board_reset_pin();
   }
   if (host_open && board_now() >= next_baud_poll) {
@@ -158,7 +158,7 @@ void line_poll(void) {
   }
   if (!open_now && host_open) { /* after the read: what was written before the close still arrives */
     host_open = false;
-    event("uart-close", "\"unplugged\":false");
+    events_emit("uart-close", "\"unplugged\":false");
   }
 }
 
@@ -170,7 +170,7 @@ static bool rates_differ(uint32_t board_baud) {
     return false;
   }
   if (!wrong_baud_reported) {
-    event("wrong-baud", "\"host\":%u,\"board\":%u", host_baud, board_baud);
+    events_emit("wrong-baud", "\"host\":%u,\"board\":%u", host_baud, board_baud);
   }
   wrong_baud_reported = true;
   line_counters.wrong_baud++;
@@ -180,7 +180,7 @@ static bool rates_differ(uint32_t board_baud) {
 int line_next_byte(uint32_t board_baud) {
   uint8_t byte;
   if (board_now() < flood_until || chance(insert_rx)) {
-    byte = random_u32();
+    byte = harness_random();
   } else {
     do {
       if (rx_count == 0) {
@@ -191,11 +191,11 @@ int line_next_byte(uint32_t board_baud) {
       rx_count--;
     } while (chance(drop_rx) && ++line_counters.rx_dropped);
     if (chance(corrupt_rx)) {
-      byte ^= 1u << (random_u32() % 8);
+      byte ^= 1u << (harness_random() % 8);
       line_counters.rx_corrupted++;
     }
     if (rates_differ(board_baud)) {
-      byte = random_u32();
+      byte = harness_random();
     }
   }
   line_counters.rx++;
@@ -214,11 +214,11 @@ void line_send(ticks_t end, uint8_t byte, uint32_t board_baud) {
     return;
   }
   if (chance(corrupt_tx)) {
-    byte ^= 1u << (random_u32() % 8);
+    byte ^= 1u << (harness_random() % 8);
     line_counters.tx_corrupted++;
   }
   if (rates_differ(board_baud)) {
-    byte = random_u32();
+    byte = harness_random();
   }
   if (tx_count == TX_ROOM) {
     line_counters.tx_unread++;

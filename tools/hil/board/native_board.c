@@ -35,11 +35,11 @@ static void start(uint8_t cause, const char *name) {
   hung = false;
   started = next_loop = watchdog_fed = now + STARTUP_TICKS;
   tx_free = 0;
-  report_reset(name);
+  harness_report_reset(name);
   supervisor_init(&logic, boot_id, cause, 0);
   for (unsigned channel = 0; channel < board_channels; channel++) {
     if (counts_now[channel]) {
-      report_duty(channel, counts_now[channel] = 0, 0, 0);
+      harness_report_duty(channel, counts_now[channel] = 0, 0, 0);
     }
   }
 }
@@ -52,7 +52,7 @@ static void loop(void) {
       continue;
     }
     counts_now[channel] = counts;
-    report_duty(channel, (double)counts / PWM_COUNTS, counts ? counts - 1 : 0, counts ? PWM_TOP : 0);
+    harness_report_duty(channel, (double)counts / PWM_COUNTS, counts ? counts - 1 : 0, counts ? PWM_TOP : 0);
   }
   ticks_t byte_ticks = (ticks_t)TICKS_PER_SECOND * 10 / BAUD;
   while (tx_free < now + TX_BUFFER * byte_ticks) {
@@ -108,13 +108,13 @@ void board_reset_pin(void) {
 }
 
 void board_power_cycle(void) {
-  boot_id = random_u32();
+  boot_id = harness_random();
   start(RESET_CAUSE_POWER_ON, "power-on");
 }
 
 void board_power_on(const struct options *options) {
   if (options->bootloader) {
-    fail(EXIT_USAGE, "the native board has no bootloader: leave --bootloader out");
+    events_fail(EXIT_USAGE, "the native board has no bootloader: leave --bootloader out");
   }
   for (unsigned channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
     measured[channel] = channel < ADC_CHANNELS && (SENSORS >> channel & 1) ? 0 : PROTOCOL_NOT_MEASURED;
@@ -127,7 +127,7 @@ bool board_runs_firmware(void) { return now >= started; }
 bool board_hang(bool deaf) {
   (void)deaf; /* there are no interrupts here */
   hung = true;
-  event("hang", "%s", "");
+  events_emit("hang", "%s", "");
   return true;
 }
 
