@@ -34,7 +34,7 @@
 #define OVER_PRESSURE_MS 100    /* ... for so long: dump */
 #define P_DISAGREE 500          /* a sensor so far from what is applied ... */
 #define DISAGREE_MS 2000        /* ... for so long: ramp vent (below: leak; above: sensor or valve stuck) */
-#define P_DOWN 500              /* faults are cleared only when every sensor is below this */
+#define P_DOWN 500              /* a channel that measures this or more still holds pressure: no fault is cleared */
 
 #define FIRMWARE_VERSION 1
 

@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define PROTOCOL_HASH 0xb60f332fUL
+#define PROTOCOL_HASH 0x3be3d7b0UL
 
 #define PROTOCOL_DELIMITER 0
 #define PROTOCOL_MAX_DECODED 96
@@ -109,6 +109,7 @@ struct __attribute__((packed)) hello {
   uint16_t sensors;
   int16_t p_min;
   int16_t p_max;
+  int16_t p_down;
   uint32_t p_full;
   uint16_t slew;
   uint16_t link_timeout_ms;

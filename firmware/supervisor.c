@@ -35,6 +35,7 @@ static void send_hello(struct supervisor *s) {
   hello.sensors = SENSORS;
   hello.p_min = P_MIN;
   hello.p_max = P_MAX;
+  hello.p_down = P_DOWN;
   hello.p_full = P_FULL;
   hello.slew = SLEW;
   hello.link_timeout_ms = LINK_TIMEOUT_MS;

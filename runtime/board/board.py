@@ -47,7 +47,6 @@ GONE_HOST = Fault.LINK_TIMEOUT | Fault.CONTROL_TIMEOUT
 VENT_WAIT_S = 3.0
 LOST_VENT_WAIT_S = 6.0  # a board in its bootloader needs up to 5 s of silence to come back
 CLEAR_WAIT_S = 1.0
-DOWN_BAR = 0.05  # P_DOWN of firmware/limits.h: above it a chamber is not empty
 DOWN_WAIT_S = 1.0  # for the air to leave, after the valves are at 0
 
 
@@ -238,7 +237,8 @@ class Board:
 
     def _pressed(self) -> dict[int, float]:
         measured_bar = self.measured_bar
-        return {int(channel): float(measured_bar[channel]) for channel in np.flatnonzero(measured_bar >= DOWN_BAR)}
+        pressed = np.flatnonzero(measured_bar >= to_bar(self.hello.p_down))
+        return {int(channel): float(measured_bar[channel]) for channel in pressed}
 
     def clear_fault(self, mask: int | None = None) -> bool:
         """Clear exactly these faults (None: all that are latched); True when the board did. It refuses while a sensor

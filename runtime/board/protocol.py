@@ -115,6 +115,7 @@ class Hello(NamedTuple):
     sensors: U16  # bit c is set where channel c has a pressure sensor
     p_min: I16
     p_max: I16
+    p_down: I16  # a channel that measures this or more still holds pressure
     p_full: U32
     slew: U16
     link_timeout_ms: U16

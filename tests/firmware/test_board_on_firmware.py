@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from modsoft.runtime import robot
 from modsoft.runtime.board import protocol
-from modsoft.runtime.board.board import DOWN_BAR, Board
+from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import Fault, State, VentMode
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, RobotFileError, Tripped
 
-ROOT = Path(__file__).resolve().parents[2]
 BOOT_MS = 840  # the bootloader's window after a reset, as measured on the emulated MEGA
 BOOTLOADER_MS = 4800  # how long it stays once it has heard something
 
@@ -506,9 +502,16 @@ def test_a_robot_that_empties_is_waited_for_no_longer_than_needed(rig):
     assert port.now_ms - began_ms <= 100
 
 
-def test_empty_means_the_same_on_both_sides():
-    limit = re.search(r"#define P_DOWN (\d+)", (ROOT / "firmware" / "limits.h").read_text())
-    assert protocol.to_units(DOWN_BAR) == int(limit[1])
+@pytest.mark.parametrize(("p_down", "residual_bar"), [(2000, {0: 0.2}), (2001, {})])
+def test_residual_pressure_is_compared_with_the_limit_that_the_board_reports(rig, p_down, residual_bar):
+    board, port = rig
+    board.arm(ROBOT)
+    run(board, port, 2)
+    board._link.hello = board.hello._replace(p_down=p_down)
+    port.follows = False  # the sensors keep showing 0.2 bar
+    port.board.measured[1:6] = [0] * 5
+    assert board.vent()
+    assert board.residual_pressures_bar() == pytest.approx(residual_bar)
 
 
 def test_restart_between_two_looks_is_seen_by_the_boot_id(rig):

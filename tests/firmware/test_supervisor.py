@@ -36,7 +36,8 @@ def test_hello_comes_unasked_once_and_first(board):
     assert first.protocol_hash == protocol.PROTOCOL_HASH
     assert (first.boot_id, first.reset_cause) == (0xB0A4D, protocol.ResetCause.POWER_ON)
     assert (first.firmware_version, first.channels, first.sensors) == (1, 11, 0x3F)
-    assert (first.p_min, first.p_max, first.p_full, first.slew) == (800, 3500, 30000, 20000)
+    assert (first.p_min, first.p_max, first.p_down) == (800, 3500, 500)
+    assert (first.p_full, first.slew) == (30000, 20000)
     assert (first.link_timeout_ms, first.control_timeout_ms) == (300, 1000)
     assert board.state == State.BOOT
     answers = []
@@ -575,21 +576,22 @@ def test_nothing_that_a_host_says_while_idle_opens_a_valve(board):
 
 
 def test_queue_for_the_host_fills_to_the_brim(board):
-    board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH)) * 4)
-    board.feed((b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0") * 5)
+    board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH)) * 3)
+    board.feed(protocol.encode(Vent(VentMode.RAMP)))
+    board.feed(b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0")
     raw = board.drain()
     kinds = [type(frame.message) for frame in protocol.Parser().feed(raw)]
-    assert kinds == [Hello] * 5 + [protocol.Nack] * 5
+    assert kinds == [Hello] * 4 + [Status, protocol.Nack]
     assert len(raw) == 255
 
 
 def test_queue_for_the_host_fills_no_further(board):
     """A full ring would look like an empty one: 256 bytes must not be queued."""
-    board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH)) * 3)
-    board.feed((b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0") * 8)
+    board.feed(protocol.encode(Vent(VentMode.RAMP)) * 2)
+    board.feed((b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0") * 4)
     raw = board.drain()
     kinds = [type(frame.message) for frame in protocol.Parser().feed(raw)]
-    assert kinds == [Hello] * 4 + [protocol.Nack] * 7
+    assert kinds == [Hello, Status, Status] + [protocol.Nack] * 3
     assert len(raw) + len(raw) - raw.rindex(b"\0\0") - 1 == 256  # one more refusal would have met the brim exactly
 
 
