@@ -48,7 +48,9 @@ from modsoft.runtime.safety import FrameValidator, check_rest
 from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.status_line import StatusLine
 from modsoft.runtime.stop import Keys, Signals, Stop, StopKey
-from modsoft.runtime.tracking.frame import LatestFrame, Reader, open_source, port_of
+from modsoft.runtime.tracking.frame import LatestFrame
+from modsoft.runtime.tracking.reader import Reader
+from modsoft.runtime.tracking.sources import open_source, port_of
 from modsoft.runtime.warmup import WarmUp
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.tracking.frame import port_of
+from modsoft.runtime.tracking.sources import port_of
 
 SCRIPT = Path(sys.executable).with_name("modsoft-runtime")
 

@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.tracking import ndi
-from modsoft.runtime.tracking.frame import LatestFrame, Reader, TrackerFrame, open_source
+from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
+from modsoft.runtime.tracking.reader import Reader
 from modsoft.runtime.tracking.replay import Replay
+from modsoft.runtime.tracking.sources import open_source
 
 ROBOT = robots.load("pneumatic-3")
 

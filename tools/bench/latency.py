@@ -51,8 +51,9 @@ from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameValidator
 from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Stop
-from modsoft.runtime.tracking.frame import LatestFrame, Reader
+from modsoft.runtime.tracking.frame import LatestFrame
 from modsoft.runtime.tracking.ndi import NDI
+from modsoft.runtime.tracking.reader import Reader
 from modsoft.runtime.warmup import WarmUp
 
 ROOT = Path(__file__).parents[2]
