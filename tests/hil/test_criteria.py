@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flawless import COUNTS, PERIOD_NS, START_NS, TICKS, flawless_run, slewed, told
+from flawless import COUNTS, PERIOD_NS, START_NS, TICKS, flawless_run, outputs_at, slewed, told
 
 from modsoft.hil import criteria as judging
 from modsoft.hil.criteria import judge
-from modsoft.hil.record import Valves
 from modsoft.hil.valves import valve_difference
 from modsoft.runtime.control.features import bending_angle_deg, from_angles_deg
 
@@ -38,40 +37,39 @@ def changed(array, index, value):
 
 def other_duty(record, shift, rows=slice(60, 61), channel=0):
     """The registers of one channel off by `shift` counts for some rows."""
-    duty = record.valves.duty.copy()
+    duty = record.outputs.duty.copy()
     duty[rows, channel] += shift / COUNTS
-    return record.valves._replace(duty=duty)
+    return record.outputs._replace(duty=duty)
 
 
 def unsettled(record):
     """A change of one channel by three counts in the middle of a settled tick, taken back 10 ms later."""
     at = record.mono_ns[50] + 300_000_000
-    row = int(np.searchsorted(record.valves.mono_ns, at))
-    glitch = record.valves.duty[row - 1].copy()
+    row = int(np.searchsorted(record.outputs.mono_ns, at))
+    glitch = record.outputs.duty[row - 1].copy()
     glitch[3] += 3 / COUNTS
-    return Valves(
-        np.insert(record.valves.mono_ns, row, [at, at + 10_000_000]),
-        np.insert(record.valves.duty, row, [glitch, record.valves.duty[row - 1]], axis=0),
-        COUNTS,
+    return outputs_at(
+        np.insert(record.outputs.mono_ns, row, [at, at + 10_000_000]),
+        np.insert(record.outputs.duty, row, [glitch, record.outputs.duty[row - 1]], axis=0),
     )
 
 
 def slower(valves):
     """The same registers, at half the slew: the time since a tick twice as long."""
     since = (valves.mono_ns - START_NS) % PERIOD_NS
-    return valves._replace(mono_ns=valves.mono_ns + since)
+    return outputs_at(valves.mono_ns + since, valves.duty)
 
 
 def late_valves(record):
     """Every change 250 ms later than commanded."""
-    return record.valves._replace(mono_ns=record.valves.mono_ns + 250_000_000)
+    return outputs_at(record.outputs.mono_ns + 250_000_000, record.outputs.duty)
 
 
 OFF_THE_LOG = "valve outputs off the log, worst of every tick and channel"
 OUTSIDE = "valve outputs outside old and new set-point, worst of all times and channels"
 LARGEST = "largest valve output ever"
 BEFORE = "largest duty before the first set-point"
-VENTED = "valve outputs at 0 for good, after the vent began"
+VENTED = "valve outputs at 0 permanently, after the vent began"
 P_MAX_COUNTS = 0.35 / 3 * COUNTS  # 477.9
 
 # Of the registers: each breaks the lines named with it, and no other.
@@ -152,7 +150,7 @@ def test_no_line_goes_without_a_flaw(flawless):
 @pytest.mark.parametrize("name", WILD)
 def test_wild_valves_break_their_lines(flawless, name):
     valves, lines = WILD[name]
-    verdict = judge(replace(flawless, valves=valves(flawless)))
+    verdict = judge(replace(flawless, outputs=valves(flawless)))
     assert set(broken(verdict)) == lines
     assert verdict.word == "failed"
 
@@ -173,19 +171,19 @@ def test_a_board_slower_than_the_robot_file_has_its_time_to_settle(flawless):
     """Its way takes twice as long as the robot file's slew says."""
     far = np.where(np.arange(TICKS)[:, None] % 2, 0.35, 0.08) * (np.arange(12) < 6)
     valves, end = slewed(flawless.start_bar, far)
-    half = replace(flawless, commanded_bar=far, valves=slower(valves), end_ns=end)
+    half = replace(flawless, commanded_bar=far, outputs=slower(valves), end_ns=end, end_us=end * 1e-3)
     assert OFF_THE_LOG in broken(judge(half))
     assert broken(judge(replace(half, slew_bar_per_s=1.0))) == []
 
 
 @pytest.mark.parametrize("valves", [unsettled, late_valves, lambda r: other_duty(r, 2, rows=slice(0, -1))])
 def test_valves_that_do_not_follow_the_log_fail(flawless, valves):
-    assert OFF_THE_LOG in broken(judge(replace(flawless, valves=valves(flawless))))
+    assert OFF_THE_LOG in broken(judge(replace(flawless, outputs=valves(flawless))))
 
 
 def test_a_valve_that_answers_another_channel_fails(flawless):
-    duty = flawless.valves.duty[:, [1, 0, *range(2, 12)]]
-    assert set(broken(judge(replace(flawless, valves=flawless.valves._replace(duty=duty))))) == {OFF_THE_LOG, OUTSIDE}
+    duty = flawless.outputs.duty[:, [1, 0, *range(2, 12)]]
+    assert set(broken(judge(replace(flawless, outputs=flawless.outputs._replace(duty=duty))))) == {OFF_THE_LOG, OUTSIDE}
 
 
 def test_every_tick_is_compared(flawless):
@@ -195,9 +193,9 @@ def test_every_tick_is_compared(flawless):
 
 def test_one_count_is_rounding(flawless):
     """Half a count of rounding stands in the registers already; another half is the firmware's right."""
-    duty = flawless.valves.duty.copy()
+    duty = flawless.outputs.duty.copy()
     duty[:-1] += 0.4 / COUNTS
-    assert judge(replace(flawless, valves=flawless.valves._replace(duty=duty))).word == "passed"
+    assert judge(replace(flawless, outputs=flawless.outputs._replace(duty=duty))).word == "passed"
 
 
 def test_a_slow_host_voids_the_timing_and_nothing_else(flawless):
@@ -231,7 +229,7 @@ def test_a_short_run_is_not_judged(flawless):
         flawless, **short, asked=flawless.asked[:50], faults=flawless.faults[:50], state=flawless.state[:50]
     )
     valves, end = slewed(flawless.start_bar, flawless.commanded_bar[:50])
-    verdict = judge(replace(record, valves=valves, end_ns=end))
+    verdict = judge(replace(record, outputs=valves, end_ns=end, end_us=end * 1e-3))
     assert broken(verdict) == []
     assert verdict.word == "not judged"
     assert "at least 100" in verdict.reason

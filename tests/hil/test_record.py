@@ -1,4 +1,4 @@
-"""Traces to figures: rows of timer registers, and how long after an instant the valves are at 0 for good."""
+"""Trace files to a record: its columns, its lateness, and what is missing from them."""
 
 import json
 import math
@@ -9,58 +9,8 @@ import pytest
 from modsoft.hil import criteria, record, report
 from modsoft.runtime import robot as robots
 
-TOP = 4095
-
-
-def pwm(t_ms, channel, duty, lag_ns=0):
-    counts = round(duty * (TOP + 1))
-    raw = [counts - 1, TOP] if counts else [0, 0]
-    return {
-        "event": "pwm",
-        "t_us": t_ms * 1e3,
-        "mono_ns": int(t_ms * 1e6) + lag_ns,
-        "channel": channel,
-        "duty": duty,
-        "raw": raw,
-    }
-
-
 READY = {"event": "ready", "channels": 3, "t_us": 0.0, "mono_ns": 0}
-
-
-def test_a_change_of_one_channel_leaves_the_others():
-    found = record.valves([READY, pwm(1, 0, 0.25), pwm(2, 2, 0.5), pwm(3, 0, 0.0)])
-    np.testing.assert_array_equal(found.duty, [[0.25, 0, 0], [0.25, 0, 0.5], [0, 0, 0.5]])
-    np.testing.assert_array_equal(found.mono_ns, [1_000_000, 2_000_000, 3_000_000])
-    assert found.counts == 4096
-
-
-def test_a_board_that_never_opened_a_valve_has_a_trace_too():
-    found = record.valves([READY])
-    assert found.duty.shape == (0, 3)
-    assert found.counts == 4096
-
-
-def test_timers_of_different_tops_are_refused():
-    other = pwm(2, 1, 0.5) | {"raw": [10, 255]}
-    with pytest.raises(ValueError, match="tops"):
-        record.valves([READY, pwm(1, 0, 0.25), other])
-
-
-def test_vented_counts_emulated_time():
-    # emulated time runs 3 ms behind at the end: the stamps of the cycle counter count
-    events = [READY, pwm(1, 0, 0.1), pwm(2, 1, 0.1), pwm(400, 0, 0.0), pwm(500, 1, 0.0, lag_ns=3_000_000)]
-    assert record.vented_after_ms(events, since_ns=100_000_000) == pytest.approx(400.0)
-
-
-def test_vented_means_for_good():
-    events = [READY, pwm(1, 0, 0.1), pwm(400, 0, 0.0), pwm(900, 0, 0.2)]
-    assert math.isnan(record.vented_after_ms(events, since_ns=100_000_000))
-    assert record.vented_after_ms([*events, pwm(1000, 0, 0.0)], 100_000_000) == pytest.approx(900.0)
-
-
-def test_vented_already_is_no_time_at_all():
-    assert record.vented_after_ms([READY, pwm(1, 0, 0.1), pwm(2, 0, 0.0)], 5_000_000) == 0.0
+OPENED = {"event": "pwm", "t_us": 1e3, "mono_ns": 1_000_000, "channel": 0, "duty": 0.25, "raw": [1023, 4095]}
 
 
 def test_lateness_is_that_of_the_run():
@@ -100,7 +50,7 @@ def run_folder(tmp_path):
     def write(slew=20000, start=True):
         run = [{"event": "start", "mono_ns": -400_000_000, "commanded_bar": [0.08] * 6 + [0] * 6}] if start else []
         run += [tick(0, None), tick(1, [0.2] * 6 + [0] * 6)]
-        for name, events in {"run": run, "board": [READY, pwm(1, 0, 0.25)], "plant": []}.items():
+        for name, events in {"run": run, "board": [READY, OPENED], "plant": []}.items():
             (tmp_path / f"{name}.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
         (tmp_path / "meta.json").write_text(json.dumps({"board": {"slew": slew} if slew else None}))
         (tmp_path / "runtime.err").write_text("one\ntoo late\n")

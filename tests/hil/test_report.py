@@ -8,7 +8,8 @@ import pytest
 
 from modsoft.hil import report
 from modsoft.hil.criteria import judge
-from modsoft.hil.record import Record, Valves
+from modsoft.hil.outputs import ValveOutputs
+from modsoft.hil.record import Record
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control.features import from_angles_deg
 
@@ -40,8 +41,9 @@ def record():
         faults=np.zeros(ticks, dtype=np.int64),
         state=["RUNNING"] * ticks,
         end_ns=ticks * 400_000_000,
+        end_us=ticks * 400_000.0,
         said_vented=True,
-        valves=Valves(np.array([0]), np.zeros((1, 12)), 4096),
+        outputs=ValveOutputs(np.array([0]), np.zeros(1), np.zeros((1, 12)), 4096),
         board_events=[],
         board_dropped_bytes=0,
         board_late_ms=0.4,

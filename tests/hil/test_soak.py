@@ -13,6 +13,7 @@ from flawless import COUNTS, flawless_run, slewed, told
 
 from modsoft.hil import soak as soaks
 from modsoft.hil.faults import FAULTS, Log
+from modsoft.hil.outputs import read_outputs
 from modsoft.hil.post_fault_checks import Injected, Ran, judge_fault, judge_log, judge_valves, judge_vent
 from modsoft.runtime import log as logs
 
@@ -56,7 +57,7 @@ def test_the_log_is_read_as_it_grows_and_only_in_whole_lines(tmp_path):
 
 def events(*duties):
     """The board's: channel 0 at these duties, at these milliseconds."""
-    pwm = {"event": "pwm", "channel": 0}
+    pwm = {"event": "pwm", "channel": 0, "raw": [0, COUNTS - 1]}
     return [{**pwm, "duty": duty, "t_us": 1e3 * at, "mono_ns": at * 10**6} for at, duty in duties]
 
 
@@ -89,7 +90,7 @@ def test_a_board_that_vents_too_late_or_never_is_found():
         assert each.wrong == found
     each = Injected(ENDING, 1, 0.0, mono_ns=10**9)
     judge_fault(each, Ran(1, code=74), True, LOST, events((900, 0.1)))
-    assert each.wrong == ["valves at 0 after nan ms, allowed 700"]
+    assert each.wrong == ["valves at 0 after inf ms, allowed 700"]
 
 
 # ---- Valves
@@ -108,7 +109,7 @@ def judged(record, stopped_ns=None):
 
 def with_counts(record, from_ms, until_ms, counts):
     at_ns = int(record.mono_ns[60])
-    return replace(record, valves=told(record, at_ns + from_ms * 10**6, at_ns + until_ms * 10**6, counts))
+    return replace(record, outputs=told(record, at_ns + from_ms * 10**6, at_ns + until_ms * 10**6, counts))
 
 
 def test_right_valves_pass(flawless):
@@ -132,17 +133,17 @@ def test_set_points_that_were_not_acknowledged_may_not_have_arrived(flawless):
     k = 60
     arrived, acknowledged = flawless.commanded_bar.copy(), flawless.acknowledged_ms.copy()
     arrived[k] = arrived[k - 1]
-    stayed = replace(flawless, valves=slewed(flawless.start_bar, arrived)[0])
+    stayed = replace(flawless, outputs=slewed(flawless.start_bar, arrived)[0])
     assert any("off" in word for word in judged(stayed))
     acknowledged[k] = np.nan
     assert judged(replace(stayed, acknowledged_ms=acknowledged)) == []
 
 
 def test_a_valve_left_open_and_one_opened_too_early_are_found(flawless):
-    left = flawless.valves._replace(duty=np.vstack([flawless.valves.duty[:-1], flawless.valves.duty[-2:-1]]))
-    assert "a valve was left open" in judged(replace(flawless, valves=left))
+    left = flawless.outputs._replace(duty=np.vstack([flawless.outputs.duty[:-1], flawless.outputs.duty[-2:-1]]))
+    assert "a valve was left open" in judged(replace(flawless, outputs=left))
     early = told(flawless, flawless.start_ns - 2 * 10**9, flawless.start_ns - 10**9, 1)
-    assert "a valve was open before the first set-point" in judged(replace(flawless, valves=early))
+    assert "a valve was open before the first set-point" in judged(replace(flawless, outputs=early))
 
 
 @pytest.mark.parametrize(
@@ -158,7 +159,7 @@ def test_a_valve_left_open_and_one_opened_too_early_are_found(flawless):
 def test_the_vent_takes_as_long_as_the_ramp_or_the_board_alone(flawless, code, zero_ms, wrong):
     board = events((9_900, 0.1), *([] if zero_ms is None else [(zero_ms, 0.0)]))
     ran = Ran(1, code=code)
-    judge_vent(ran, replace(flawless, end_ns=10_000 * 10**6), board)
+    judge_vent(ran, replace(flawless, end_ns=10_000 * 10**6, end_us=1e7, outputs=read_outputs(board)))
     assert bool(ran.wrong) == wrong
 
 

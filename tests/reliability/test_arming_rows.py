@@ -2,10 +2,10 @@
 
 import pytest
 from mega_in_run import stepped_host
+from output_rises import rises
+from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard, missing_packages
-from modsoft.hil.stepped import SteppedPort
-from modsoft.hil.trace import rises
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board import connection
 from modsoft.runtime.board.protocol import (

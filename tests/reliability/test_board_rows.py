@@ -13,9 +13,10 @@ from itertools import pairwise
 import mega_in_run
 import pytest
 from mega_in_run import Host, in_stepped_run, inject, side_by_side
+from output_rises import rises
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event, missing_packages
-from modsoft.hil.trace import rises, vented_us
+from modsoft.hil.outputs import read_outputs
 from modsoft.runtime.board.protocol import (
     CHANNELS,
     PROTOCOL_HASH,
@@ -43,7 +44,9 @@ AT_ONCE = 2  # boards; each takes what it can get of a core
 
 
 def vented_ms(emulated, since, from_us):
-    return (vented_us(emulated.trace, since) - from_us) / 1000
+    """From an instant until every output is at 0; one was open at `trace[since]`."""
+    assert read_outputs(emulated.trace[:since]).duty[-1].any(), "nothing to vent"
+    return read_outputs(emulated.trace).vented_after_ms(from_us)
 
 
 def lost_ms(host, from_us):

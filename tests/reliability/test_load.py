@@ -13,7 +13,7 @@ import pytest
 from mega_in_run import side_by_side
 from runtime_in_run import Run, Stand
 
-from modsoft.hil import record
+from modsoft.hil.outputs import emulated_us, read_outputs
 from modsoft.runtime.board.protocol import Fault
 from modsoft.runtime.control.tasks import REAL_STEPS
 from modsoft.runtime.errors import LostInRun, Tripped
@@ -137,7 +137,7 @@ def test_row_26_halted_for_50_to_600_ms(matrix_row, full, strong_model, tmp_path
                 assert not went_on, "the board cannot have heard anything for too long"
             vented_ms = None
             if not went_on:
-                vented_ms = record.vented_after_ms(events, began_ns)
+                vented_ms = read_outputs(events).vented_after_ms(emulated_us(events, began_ns))
                 assert vented_ms <= VENTED_MS
             else:
                 faults = {line["board"]["faults"] for line in log.ticks if line["board"]}

@@ -10,11 +10,11 @@ from types import SimpleNamespace
 
 import pytest
 from mega_in_run import Host, in_stepped_run, inject, side_by_side, stepped_host
+from output_rises import rises
 from runtime_in_run import Run, Stand
+from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event, missing_packages
-from modsoft.hil.stepped import SteppedPort
-from modsoft.hil.trace import rises
 from modsoft.runtime.board import connection, ports
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import PROTOCOL_HASH, State

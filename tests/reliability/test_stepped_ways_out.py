@@ -5,10 +5,11 @@ import signal
 
 import numpy as np
 import pytest
+from output_rises import rises
 from stepped_run import SteppedRun
 
 from modsoft.hil.board.emulator import EmulatedBoard, missing_packages
-from modsoft.hil.trace import rises, vented_us
+from modsoft.hil.outputs import read_outputs
 from modsoft.runtime.errors import INTERNAL_EXIT_CODE
 
 missing = missing_packages("simavr")
@@ -69,7 +70,7 @@ def test_row_12_every_way_out_vents_at_any_phase(name, matrix_row, full, tmp_pat
             opened = rises(emulated.trace) > 0
             pressed += opened
             if opened:
-                worst_s = max(worst_s, vented_us(emulated.trace) * 1e-6 - run.caused_s)
+                worst_s = max(worst_s, 1e-3 * read_outputs(emulated.trace).vented_after_ms(1e6 * run.caused_s))
     matrix_row(
         12,
         fault=f"{name}, at any phase",

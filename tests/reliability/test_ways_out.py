@@ -7,9 +7,10 @@ import time
 import numpy as np
 import pytest
 from mega_in_run import in_stepped_run, inject, side_by_side
+from output_rises import rises
 from runtime_in_run import FAULTY, SCRIPT, Run, Stand, if_begun
 
-from modsoft.hil.trace import rises, vented_us
+from modsoft.hil.outputs import read_outputs
 from modsoft.runtime.board.protocol import Fault, State
 from modsoft.runtime.errors import LostInRun, Tripped
 
@@ -180,7 +181,7 @@ def test_row_11_host_stands_still(name, matrix_row, full, strong_model, tmp_path
             now, since = inject(stand.board, "stats", "stats")
             cause(run)
             time.sleep(3.0)
-            took_ms = (vented_us(stand.board.trace, since) - now["t_us"]) / 1000
+            took_ms = read_outputs(list(stand.board.trace)).vented_after_ms(now["t_us"])
             run.process.send_signal(signal.SIGCONT)
             code, _ = run.left()
             assert code in codes, run.said

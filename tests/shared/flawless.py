@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from modsoft.hil.record import Record, Valves
+from modsoft.hil.outputs import ValveOutputs
+from modsoft.hil.record import Record
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control.actuation import channel_pressures_bar
 from modsoft.runtime.control.features import from_angles_deg
@@ -27,7 +28,12 @@ def slewed(start, commanded):
             times.append(now)
             rows.append(np.round(applied / ROBOT.valve.full_scale_bar * COUNTS) / COUNTS)
             now += 10_000_000
-    return Valves(np.array(times), np.array(rows), COUNTS), end
+    return outputs_at(np.array(times), np.array(rows)), end
+
+
+def outputs_at(mono_ns, duty):
+    """Outputs of a board whose clock is the host's."""
+    return ValveOutputs(mono_ns, mono_ns * 1e-3, duty, COUNTS)
 
 
 def flawless_run():
@@ -63,8 +69,9 @@ def flawless_run():
         faults=np.zeros(TICKS, dtype=np.int64),
         state=["RUNNING"] * TICKS,
         end_ns=end,
+        end_us=end * 1e-3,
         said_vented=True,
-        valves=valves,
+        outputs=valves,
         board_events=[{"event": "reset", "cause": "external", "mono_ns": START_NS - 3_000_000_000}],
         board_dropped_bytes=0,
         board_late_ms=1.2,
@@ -79,11 +86,11 @@ def flawless_run():
 
 def told(record, from_ns, until_ns, counts, channel=0):
     """One channel at `counts` from an instant to another, whatever else the registers say meanwhile."""
-    valves = record.valves
+    valves = record.outputs
     edges = [valves.between(at, at)[-1] for at in (from_ns, until_ns)]
     mono_ns = np.concatenate([valves.mono_ns, [from_ns, until_ns]])
     order = np.argsort(mono_ns, kind="stable")
     duty = np.vstack([valves.duty, edges])[order]
     mono_ns = mono_ns[order]
     duty[(mono_ns >= from_ns) & (mono_ns < until_ns), channel] = counts / COUNTS
-    return Valves(mono_ns, duty, COUNTS)
+    return outputs_at(mono_ns, duty)

@@ -11,9 +11,9 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard
-from modsoft.hil.stepped import SteppedPort
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.ports import open_port

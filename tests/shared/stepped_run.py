@@ -8,9 +8,9 @@ import contextlib
 import math
 
 import numpy as np
+from stepped_port import SteppedPort
 from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
-from modsoft.hil.stepped import SteppedPort
 from modsoft.runtime import session
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.clock import Ticker

@@ -20,7 +20,6 @@ from modsoft.hil.valves import (
     valve_difference,
     valve_excursion,
     vent_limit_ms,
-    vented_after_ms,
 )
 from modsoft.runtime.control.features import angle_between_deg, bending_error_deg
 from modsoft.runtime.statistics import spread
@@ -124,7 +123,7 @@ def criteria(record: Record) -> list[Criterion]:
     unacknowledged = int(np.isnan(record.acknowledged_ms).sum())
     acknowledged = record.acknowledged_ms[~np.isnan(record.acknowledged_ms)]
     differences = valve_difference(record)
-    highest = float(np.max(record.valves.duty, initial=0.0)) * record.valves.counts
+    highest = float(np.max(record.outputs.duty, initial=0.0)) * record.outputs.counts
     allowed = round(record.robot.valve.p_max_bar * full_counts_per_bar(record), 2) if record.robot.valve else 0.0
     running = [event for event in record.board_events if count and event["mono_ns"] >= record.mono_ns[0]]
     watchdogs = sum(event["event"] == "watchdog" for event in record.board_events)
@@ -166,7 +165,10 @@ def criteria(record: Record) -> list[Criterion]:
         at_most("bytes dropped by the board's receiver", record.board_dropped_bytes, DROPPED_BYTES),
         Criterion("the board's word that it vented", "yes" if record.said_vented else "no", "yes", record.said_vented),
         at_most(
-            "valve outputs at 0 for good, after the vent began", vented_after_ms(record), vent_limit_ms(record), " ms"
+            "valve outputs at 0 permanently, after the vent began",
+            record.outputs.vented_after_ms(record.end_us),
+            vent_limit_ms(record),
+            " ms",
         ),
         at_most(
             "highest chamber pressure at the end",

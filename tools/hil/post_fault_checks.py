@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from modsoft.hil import record, valves
+from modsoft.hil import outputs, record, valves
 from modsoft.hil.criteria import DESIRED_OFF, VALVE_COUNTS, desired_off
 from modsoft.hil.faults import ON_ITS_OWN_MS, Fault
 from modsoft.runtime import log as logs
@@ -27,7 +27,7 @@ class Injected:
     noticed_ms: float | None = None  # until a line of the log said so
     code: int | None = None  # of the run, where it ended
     words: str = ""
-    vented_ms: float | None = None  # emulated, until every valve was at 0 for good, where the board did it alone
+    vented_ms: float | None = None  # emulated, until every valve was at 0 permanently, where the board vented alone
     wrong: list[str] = field(default_factory=list)
 
 
@@ -81,17 +81,18 @@ def judge_fault(each: Injected, ran: Ran, ended: bool, said: str, events: list[L
     if fault.goes_by and each.noticed_ms is None and not ended:
         each.wrong.append("not noticed")
     if fault.vents_ms is not None:
-        each.vented_ms = record.vented_after_ms(events, each.mono_ns)
+        since_us = outputs.emulated_us(events, each.mono_ns)
+        each.vented_ms = outputs.read_outputs(events).vented_after_ms(since_us)
         if not each.vented_ms <= fault.vents_ms:
             each.wrong.append(f"valves at 0 after {each.vented_ms:.0f} ms, allowed {fault.vents_ms:.0f}")
 
 
-def judge_vent(ran: Ran, found: record.Record, events: list[Line]) -> None:
+def judge_vent(ran: Ran, found: record.Record) -> None:
     """After a run that the runtime ended itself, every valve at 0 in time, on the board's own clock: by the ramp; where
     it had lost the board and so told it nothing, by the board's own timer."""
     if found.end_ns < 0 or ran.code < 0:
         return
-    ran.vented_ms = record.vented_after_ms(events, found.end_ns)
+    ran.vented_ms = found.outputs.vented_after_ms(found.end_us)
     limit_ms = ON_ITS_OWN_MS if ran.code == LostInRun.exit_code else valves.vent_limit_ms(found)
     if not ran.vented_ms <= limit_ms:
         ran.wrong.append(f"valves at 0 only {ran.vented_ms:.0f} ms after the vent began, allowed {limit_ms:.0f}")
@@ -102,19 +103,19 @@ def judge_valves(ran: Ran, found: record.Record, stopped_ns: int | None) -> None
     all at 0 in the end. `stopped_ns`: from when on the board vents by itself, which is never wrong."""
     if found.start_ns is None:
         return
-    low = high = np.zeros(found.valves.duty.shape[1])
+    low = high = np.zeros(found.outputs.duty.shape[1])
     acknowledged = [True, *~np.isnan(found.acknowledged_ms), False]
     stopped_ns = found.end_ns if stopped_ns is None else stopped_ns
     for span, known in zip(valves.spans(found), acknowledged, strict=True):
         # What was not acknowledged may not have arrived: then the set-point before still stands.
         low, high = np.minimum(low, span.commanded), np.maximum(high, span.commanded)
-        stood = found.valves.between(span.from_ns, span.until_ns) * found.valves.counts
+        stood = found.outputs.between(span.from_ns, span.until_ns) * found.outputs.counts
         ran.over_counts = max(ran.over_counts, float(np.max(stood - high)))
         if span.from_ns < stopped_ns:
-            stood = found.valves.between(span.from_ns, min(span.until_ns, stopped_ns)) * found.valves.counts
+            stood = found.outputs.between(span.from_ns, min(span.until_ns, stopped_ns)) * found.outputs.counts
             ran.under_counts = max(ran.under_counts, float(np.max(low - stood)))
         if known and span.settled_ns < min(span.until_ns, stopped_ns):
-            stood = found.valves.between(span.settled_ns, min(span.until_ns, stopped_ns)) * found.valves.counts
+            stood = found.outputs.between(span.settled_ns, min(span.until_ns, stopped_ns)) * found.outputs.counts
             ran.off_counts = max(ran.off_counts, float(np.max(np.abs(stood - span.commanded))))
             low = high = span.commanded
     for counts, word in ((ran.over_counts, "above"), (ran.under_counts, "below"), (ran.off_counts, "off")):
@@ -124,5 +125,5 @@ def judge_valves(ran: Ran, found: record.Record, stopped_ns: int | None) -> None
         ran.wrong.append("a valve was open before the first set-point")
     if not desired_off(found) <= DESIRED_OFF:
         ran.wrong.append("the log's desired configurations are not the task's")
-    if found.valves.duty[-1:].any():
+    if found.outputs.duty[-1:].any():
         ran.wrong.append("a valve was left open")

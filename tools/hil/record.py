@@ -6,13 +6,14 @@ import hashlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.hil.board.emulator import FIRMWARE, FIRMWARE_ELF
+from modsoft.hil.outputs import ValveOutputs, emulated_us, read_outputs
 from modsoft.runtime import log
 from modsoft.runtime.board.protocol import CHANNELS, to_bar
 from modsoft.runtime.robot import Robot
@@ -21,21 +22,6 @@ Array = NDArray[np.float64]
 Line = dict[str, Any]
 
 LATE_BOUND_MS = 20.0  # board.c: emulated time never falls further behind, it gives way and says `late`
-
-
-class Valves(NamedTuple):
-    """Duties of all channels from the timer registers. Row j holds from mono_ns[j] until mono_ns[j + 1]."""
-
-    mono_ns: NDArray[np.int64]  # (E,)
-    duty: Array  # (E, channels)
-    counts: int  # of a full duty
-
-    def between(self, start_ns: int, end_ns: int) -> Array:
-        """Every duty (n, channels) that stood at some time in [start, end]; zeros before the first row."""
-        first = int(np.searchsorted(self.mono_ns, start_ns, side="right")) - 1
-        last = int(np.searchsorted(self.mono_ns, end_ns, side="right"))
-        rows = self.duty[max(first, 0) : last]
-        return np.vstack([np.zeros((1, self.duty.shape[1])), rows]) if first < 0 else rows
 
 
 @dataclass(frozen=True)
@@ -63,8 +49,9 @@ class Record:
     faults: NDArray[np.int64]  # (K,)
     state: list[str]  # (K,) the board's
     end_ns: int  # the vent begins: outputs no longer follow the last tick
+    end_us: float  # that instant in emulated time; NaN where the run never began
     said_vented: bool  # the runtime, on the board's word
-    valves: Valves
+    outputs: ValveOutputs
     board_events: list[dict[str, Any]]  # resets and watchdog, all of the emulator's life
     board_dropped_bytes: float  # by the board's receiver; NaN where it did not say
     board_late_ms: float  # largest lateness of emulated time in the run
@@ -125,8 +112,9 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, asked: np.ndar
         faults=np.array([tick["board"]["faults"] if tick["board"] else 0 for tick in ticks], dtype=np.int64),
         state=[tick["board"]["state"] if tick["board"] else "unknown" for tick in ticks],
         end_ns=end_ns,
+        end_us=emulated_us(events, end_ns),
         said_vented=bool(end and end["vented"]),
-        valves=valves(events),
+        outputs=read_outputs(events),
         board_events=[event for event in events if event["event"] in ("reset", "watchdog")],
         board_dropped_bytes=summary.get("rx_overrun", math.nan),
         **_board_lateness(events, summary, start_ns, end_ns),
@@ -192,39 +180,6 @@ def lines(path: Path) -> list[Line]:
     for text in path.read_bytes().split(b"\n")[:-1]:
         found.append(decode(text))
     return found
-
-
-def valves(events: list[Line]) -> Valves:
-    """Timer registers over time, a row for each change, from the board's `pwm` events."""
-    changes = [event for event in events if event["event"] == "pwm"]
-    ready = next(event for event in events if event["event"] == "ready")
-    channels = max([ready["channels"], *(event["channel"] + 1 for event in changes)])
-    duty = np.zeros((len(changes), channels))
-    now = np.zeros(channels)
-    for row, event in enumerate(changes):
-        now[event["channel"]] = event["duty"]
-        duty[row] = now
-    tops = {event["raw"][1] for event in changes if event["duty"] > 0}
-    if len(tops) > 1:
-        raise ValueError(f"the board's timers count to different tops: {sorted(tops)}")
-    return Valves(np.array([event["mono_ns"] for event in changes], dtype=np.int64), duty, max(tops, default=4095) + 1)
-
-
-def vented_after_ms(events: list[Line], since_ns: int) -> float:
-    """Emulated milliseconds from an instant of CLOCK_MONOTONIC until every output is at 0 to stay, from the cycle
-    counter's stamps; NaN when they never are. The instant is put into emulated time by the nearest event before it."""
-    before = [event for event in events if event["mono_ns"] <= since_ns]
-    since_us = before[-1]["t_us"] + (since_ns - before[-1]["mono_ns"]) * 1e-3
-    duty = {event["channel"]: event["duty"] for event in before if event["event"] == "pwm"}
-    vented_us = since_us if not any(duty.values()) else math.nan
-    for event in events[len(before) :]:
-        if event["event"] == "pwm":
-            duty[event["channel"]] = event["duty"]
-            if any(duty.values()):
-                vented_us = math.nan
-            elif math.isnan(vented_us):
-                vented_us = event["t_us"]
-    return (vented_us - since_us) * 1e-3
 
 
 def board_in_words(board: str) -> str:

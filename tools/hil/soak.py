@@ -191,7 +191,7 @@ class Soak:
         alone = last if last and (last.fault.vents_ms is not None or last.fault.goes_by) else None
         found = record.read(folder, run, rig.robot, str(self._task), self._desired, ran.code)
         post_fault_checks.judge_valves(ran, found, None if alone is None else alone.mono_ns)
-        post_fault_checks.judge_vent(ran, found, events)
+        post_fault_checks.judge_vent(ran, found)
         ran.stalled_ms = 1e-3 * sum(event["late_us"] for event in events if event["event"] == "late")
 
 

@@ -30,7 +30,7 @@ def spans(record: Record) -> Iterator[Span]:
     """Every set-point: the first one, those of the ticks, and at last the vent, which is a set-point of 0 for ever."""
     if record.start_ns is None:
         return
-    channels = record.valves.duty.shape[1]
+    channels = record.outputs.duty.shape[1]
     scale = full_counts_per_bar(record)
     set_points_bar = [record.start_bar[:channels], *record.commanded_bar[:, :channels], np.zeros(channels)]
     begins_ns = [record.start_ns, *(int(at) for at in record.mono_ns), record.end_ns, FOR_EVER_NS]
@@ -47,21 +47,21 @@ def spans(record: Record) -> Iterator[Span]:
 
 def full_counts_per_bar(record: Record) -> float:
     assert record.robot.valve is not None  # the rig runs no other robots
-    return record.valves.counts / record.robot.valve.full_scale_bar
+    return record.outputs.counts / record.robot.valve.full_scale_bar
 
 
 def valve_difference(record: Record) -> Array:
     """Largest difference (K + 1,) of timer registers from what the log says was commanded, in counts, over all channels
     and all the time from when the slew must have settled until the next tick starts; the first is that of the set-point
     before the first tick. NaN: no such time."""
-    channels = record.valves.duty.shape[1]
+    channels = record.outputs.duty.shape[1]
     if record.commanded_bar[:, channels:].any():
         return np.full(len(record.tick) + 1, np.inf)  # a set-point for a channel that the board does not have
     worst = []
     for span in list(spans(record))[:-1]:  # the vent has its own line
         worst.append(math.nan)
         if span.settled_ns <= span.until_ns:
-            stood = record.valves.between(span.settled_ns, span.until_ns) * record.valves.counts
+            stood = record.outputs.between(span.settled_ns, span.until_ns) * record.outputs.counts
             worst[-1] = float(np.max(np.abs(stood - span.commanded)))
     return np.array(worst)
 
@@ -71,7 +71,7 @@ def valve_excursion(record: Record) -> Array:
     the one before it, in counts; the last is that of the vent."""
     worst = []
     for span in spans(record):
-        stood = record.valves.between(span.from_ns, span.until_ns) * record.valves.counts
+        stood = record.outputs.between(span.from_ns, span.until_ns) * record.outputs.counts
         low, high = np.minimum(span.before, span.commanded), np.maximum(span.before, span.commanded)
         worst.append(np.max(np.maximum(low - stood, stood - high), initial=0.0))
     return np.array(worst)
@@ -80,17 +80,7 @@ def valve_excursion(record: Record) -> Array:
 def largest_duty_before(record: Record) -> float:
     """Of all channels, until the runtime gave its first set-point; ever, where it gave none."""
     until_ns = FOR_EVER_NS if record.start_ns is None else record.start_ns
-    return float(np.max(record.valves.between(-FOR_EVER_NS, until_ns)))
-
-
-def vented_after_ms(record: Record) -> float:
-    """From the beginning of the vent until every timer register is at 0 for good; infinite where one never is."""
-    told = np.flatnonzero(record.valves.duty.any(axis=1))
-    if not len(told):
-        return 0.0
-    if told[-1] + 1 == len(record.valves.duty):
-        return math.inf
-    return max(0.0, float(record.valves.mono_ns[told[-1] + 1] - record.end_ns) * 1e-6)
+    return float(np.max(record.outputs.between(-FOR_EVER_NS, until_ns)))
 
 
 def vent_limit_ms(record: Record) -> float:

@@ -180,7 +180,7 @@ class EmulatedBoard:
         port_link: where the link to the serial port goes; a temporary folder where it is None.
         fast: run as fast as it can. The board's time-outs then fire early for a host in real time: only emulated
         times (`t_us`) are worth anything.
-        stepped: its time stands still but for `run`; see `modsoft.hil.stepped`.
+        stepped: its time stands still but for `run`; tests/shared/stepped_port.py is a serial port for it.
         """
         self.board = choose(board)
         self._firmware = firmware
