@@ -12,4 +12,5 @@ for part in hil study; do ln -sfn "../../../tools/$part" "build/types/modsoft/$p
 find firmware tests tools training \( -name '*.[ch]' -o -name '*.ino' \) -exec \
     "$bin/python" -c 'import clang_format; clang_format.clang_format()' --dry-run -Werror {} +
 "$bin/python" tools/gen_protocol.py --check
+"$bin/python" tools/wiring.py --check
 "$bin/mypy" -p modsoft.runtime -p modsoft.export -p modsoft.hil -p modsoft.training -p modsoft.study
