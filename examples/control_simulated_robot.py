@@ -18,7 +18,7 @@ def main() -> None:
     model.check(robot)  # trained for a robot of this kind?
     desired = task("down", "pneumatic", robot.modules)  # (K, N, 3), one configuration a control step
     arm = simulated("pneumatic", robot.modules, 1)
-    [run] = rollout(robot, arm, [ControllerSetup(model.actuate, model.history, desired)])
+    run = rollout(arm, [ControllerSetup(robot, model.actuate, model.history, desired)]).robots()[0]
     for module, error in enumerate(angle_errors_deg(run.configuration, desired).mean(axis=0), start=1):
         print(f"module {module}: mean error of the bending angle {error:.2f} degrees")
 

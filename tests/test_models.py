@@ -41,8 +41,8 @@ def test_a_shipped_model_drives_its_robot(file, robot, task, most):
     robot = robots.load(robot)
     controller = Model.load(MODELS / f"{file}.onnx")
     desired = tasks.task(task, robot.robot.kind, robot.modules)[:60]
-    pilot = ControllerSetup(controller.actuate, controller.history, desired)
-    (flight,) = rollout.rollout(robot, Fleet(robot.robot.kind, robot.modules, 1), [pilot])
+    pilot = ControllerSetup(robot, controller.actuate, controller.history, desired)
+    (flight,) = rollout.rollout(Fleet(robot.robot.kind, robot.modules, 1), [pilot]).robots()
     errors = rollout.angle_errors_deg if robot.robot.kind == "pneumatic" else rollout.configuration_errors_percent
     assert errors(flight.configuration, desired).mean(axis=0).max() < most
     still = np.broadcast_to(flight.configuration[:1], (61, robot.modules, 3))

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.entry_point import entry
-from modsoft.runtime.errors import ModelError
+from modsoft.runtime.errors import ModelError, ModsoftError
 from modsoft.runtime.files import NOT_AN_ARRAY, check_not_input, check_writable, written
 from modsoft.runtime.robot import Robot
+from modsoft.training.simulation.fleet import Arms
+from modsoft.training.simulation.rollout import rollout
 
 Array = NDArray[np.float64]
 
@@ -44,25 +46,19 @@ def read_actions(path: str, robot: Robot) -> Array:
 def simulate(robot: Robot, actions: Array) -> dict[str, Array]:
     """Applies actions (steps, N, A), one a control period, from rest.
 
-    Arrays of what was before the first and after each action: configuration (steps + 1, N, 3), [v_x, v_y, v_z];
-    positions (steps + 1, N, 3), m; directors (steps + 1, N, 3, 3), rows d1, d2, d3. `ModsoftError` if the robot's
-    state stops being finite.
+    Returns the states before the first and after each action: configuration (steps + 1, N, 3), [v_x, v_y, v_z];
+    positions (steps + 1, N, 3), m; directors (steps + 1, N, 3, 3), rows d1, d2, d3. Raises `ModsoftError` if the
+    simulation diverges.
     """
-    from modsoft.training.simulation.elastica import (
-        Arm,  # PyElastica takes seconds to import: not for --help or a wrong file
-    )
-
-    arm = Arm(robot.robot.kind, robot.modules)
-    configuration, positions, directors = [arm.configuration], [arm.positions], [arm.directors]
-    for action in actions:
-        configuration.append(arm.step(action, robot.loop.period_s))
-        positions.append(arm.positions)
-        directors.append(arm.directors)
-    return {
-        "configuration": np.stack(configuration),
-        "positions": np.stack(positions),
-        "directors": np.stack(directors),
-    }
+    arms = Arms(robot.robot.kind, robot.modules, 1)
+    (run,) = rollout(arms, actions[:, None], period_s=robot.loop.period_s).robots()
+    if not arms.alive[0]:
+        step = int(np.isnan(run.configuration).any(axis=(1, 2)).argmax()) - 1
+        raise ModsoftError(
+            f"the simulated robot {robot.name} diverges under the action of step {step}; expected a bounded motion; "
+            "change the actuation by less in a step"
+        )
+    return {"configuration": run.configuration, "positions": run.positions, "directors": run.directors}
 
 
 def write(path: str, run: dict[str, Array]) -> None:

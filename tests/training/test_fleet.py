@@ -12,6 +12,7 @@ from modsoft.training.simulation import fleet, fleet_kernel
 from modsoft.training.simulation.elastica import Arm
 from modsoft.training.simulation.fleet import Arms, Fleet
 from modsoft.training.simulation.parameters import PLANTS
+from modsoft.training.simulation.rollout import rollout
 
 pytestmark = pytest.mark.instructions
 
@@ -20,6 +21,11 @@ REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
 ACTIONS = {"cable": 2, "pneumatic": 1}
 
 needs_kernel = pytest.mark.skipif(fleet_kernel.library() is None, reason="the kernel is not built here (no C compiler)")
+
+
+def configurations(robots, drawn):
+    """(K + 1, B, N, 3) under the actions (K, B, N, A)."""
+    return rollout(robots, drawn).configuration
 
 
 def actions(kind, periods, count, modules, seed=0, largest=1.0):
@@ -39,7 +45,7 @@ def arm_run(kind, modules, drawn):
 def largest_difference(kind, modules, periods, seed):
     """Between the fleet and PyElastica, both with explicit damping, after every period of full-range random actions."""
     drawn = actions(kind, periods, 1, modules, seed)
-    configuration = Fleet(kind, modules, 1, damping="explicit").run(drawn)
+    configuration = configurations(Fleet(kind, modules, 1, damping="explicit"), drawn)
     return np.abs(configuration[:, 0] - arm_run(kind, modules, drawn[:, 0])).max()
 
 
@@ -79,17 +85,20 @@ def test_equals_pyelastica_for_other_module_numbers(kind, modules, periods):
 def test_robots_off_the_drawing_equal_pyelastica_too(kind, modules, periods, stiffness, payload_modules):
     changed = {"stiffness": stiffness, "tip_payload_kg": payload_modules * PLANTS[kind].module_kg}
     drawn = actions(kind, periods, 1, modules, seed=modules)
-    robots = Fleet(kind, modules, 1, damping="explicit", **changed).run(drawn)[:, 0]
-    arm = Arms(kind, modules, 1, **changed).run(drawn)[:, 0]
+    robots = configurations(Fleet(kind, modules, 1, damping="explicit", **changed), drawn)[:, 0]
+    arm = configurations(Arms(kind, modules, 1, **changed), drawn)[:, 0]
     assert np.abs(robots - arm).max() < 1e-9
-    assert np.abs(robots - Fleet(kind, modules, 1, damping="explicit").run(drawn)[:, 0]).max() > 0.02
+    assert np.abs(robots - configurations(Fleet(kind, modules, 1, damping="explicit"), drawn)[:, 0]).max() > 0.02
 
 
 @needs_kernel
 def test_a_softer_module_bends_further_and_the_others_much_as_before():
     """Held until the robot stands still, nearly: the couple of the cables is the same."""
     drawn = np.broadcast_to([[0.3, 0.0]] * 3, (20, 1, 3, 2))
-    stiff, soft = Fleet("cable", 3, 1).run(drawn), Fleet("cable", 3, 1, stiffness=[1.0, 0.8, 1.0]).run(drawn)
+    stiff, soft = (
+        configurations(Fleet("cable", 3, 1), drawn),
+        configurations(Fleet("cable", 3, 1, stiffness=[1.0, 0.8, 1.0]), drawn),
+    )
     angle = np.degrees(np.arccos([stiff[-1, 0, :, 2], soft[-1, 0, :, 2]]))
     assert 1.1 < angle[1, 1] / angle[0, 1] < 1.4
     assert np.abs(angle[1, [0, 2]] / angle[0, [0, 2]] - 1.0).max() < 0.1
@@ -101,7 +110,7 @@ def test_a_softer_module_bends_further_and_the_others_much_as_before():
 def test_robots_off_the_drawing_stay_whole_under_full_range_jumps(modules, factor):
     drawn = np.random.default_rng(modules).choice([-1.0, 1.0], (3, 16, modules, 2))
     robots = Fleet("cable", modules, 16, stiffness=[factor] * modules, tip_payload_kg=PLANTS["cable"].module_kg)
-    robots.run(drawn)
+    configurations(robots, drawn)
     assert robots.alive.all()
 
 
@@ -135,14 +144,14 @@ def recorded():
 @needs_kernel
 def test_replays_the_recorded_runs(recorded):
     drawn, configuration = recorded
-    replayed = Fleet("cable", 4, 3, damping="explicit").run(drawn)
+    replayed = configurations(Fleet("cable", 4, 3, damping="explicit"), drawn)
     assert np.abs(replayed[:-1] - configuration).max() < 5e-6
 
 
 @needs_kernel
 def test_exponential_damping_stays_close_to_the_recorded_runs(recorded):
     drawn, configuration = recorded
-    replayed = Fleet("cable", 4, 3).run(drawn[:60])
+    replayed = configurations(Fleet("cable", 4, 3), drawn[:60])
     assert np.abs(replayed[:-1] - configuration[:60]).mean() < 2e-6
 
 
@@ -150,17 +159,17 @@ def test_exponential_damping_stays_close_to_the_recorded_runs(recorded):
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
 def test_numbers_do_not_depend_on_place_or_company(kind):
     drawn = actions(kind, 2, 19, 3, seed=1)
-    together = Fleet(kind, 3, 19).run(drawn)
-    assert np.array_equal(together[:, 5:6], Fleet(kind, 3, 1).run(drawn[:, 5:6]))
+    together = configurations(Fleet(kind, 3, 19), drawn)
+    assert np.array_equal(together[:, 5:6], configurations(Fleet(kind, 3, 1), drawn[:, 5:6]))
     order = np.random.default_rng(2).permutation(19)
-    assert np.array_equal(together[:, order], Fleet(kind, 3, 19, threads=2).run(drawn[:, order]))
+    assert np.array_equal(together[:, order], configurations(Fleet(kind, 3, 19, threads=2), drawn[:, order]))
 
 
 @needs_kernel
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
 def test_variants_agree(kind):
     drawn = actions(kind, 3, 3, 2, seed=3)
-    runs = [Fleet(kind, 2, 3, variant=name).run(drawn) for name in fleet_kernel.variants()]
+    runs = [configurations(Fleet(kind, 2, 3, variant=name), drawn) for name in fleet_kernel.variants()]
     for run in runs[1:]:
         assert np.abs(run - runs[0]).max() < 1e-11
 
@@ -169,12 +178,12 @@ def test_variants_agree(kind):
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
 def test_a_lost_robot_is_reported_and_the_others_are_untouched(kind):
     drawn = actions(kind, 3, 10, 2, seed=4)
-    whole = Fleet(kind, 2, 10).run(drawn)
+    whole = configurations(Fleet(kind, 2, 10), drawn)
     robots = Fleet(kind, 2, 10)
-    before = robots.run(drawn[:1])
+    before = configurations(robots, drawn[:1])
     robots._state[:, 5, 3, 3] = np.inf  # the velocity of one node of robot 3 and of those in its lane in other blocks
     lost = np.arange(10) % robots.lanes == 3
-    run = np.concatenate([before, robots.run(drawn[1:])[1:]])
+    run = np.concatenate([before, configurations(robots, drawn[1:])[1:]])
     assert np.array_equal(robots.alive, ~lost)
     assert np.array_equal(run[:, ~lost], whole[:, ~lost])
     assert np.isnan(run[2:, lost]).any(axis=(2, 3)).all()
@@ -188,9 +197,9 @@ def test_a_lost_robot_is_reported_and_the_others_are_untouched(kind):
 def test_reset_begins_the_same_run_again():
     drawn = actions("pneumatic", 3, 4, 2, seed=5)
     robots = Fleet("pneumatic", 2, 4)
-    first = robots.run(drawn)
+    first = configurations(robots, drawn)
     robots.reset()
-    assert np.array_equal(robots.run(drawn), first)
+    assert np.array_equal(configurations(robots, drawn), first)
 
 
 @needs_kernel
@@ -198,15 +207,17 @@ def test_reset_begins_the_same_run_again():
 def test_a_snapshot_goes_on_where_it_was_taken(kind):
     drawn = actions(kind, 4, 11, 2, seed=8)
     robots = Fleet(kind, 2, 11)
-    robots.run(drawn[:2])
+    configurations(robots, drawn[:2])
     taken = robots.snapshot()
-    went = robots.run(drawn[2:])
+    went = configurations(robots, drawn[2:])
     robots.restore(taken)
-    assert np.array_equal(robots.run(drawn[2:]), went)
+    assert np.array_equal(configurations(robots, drawn[2:]), went)
     # One robot's snapshot, in all the others: they repeat what it did.
     robots.restore(taken)
     robots.restore(robots.snapshot([9]))
-    assert np.array_equal(robots.run(np.repeat(drawn[2:, 9:10], 11, axis=1)), np.repeat(went[:, 9:10], 11, axis=1))
+    assert np.array_equal(
+        configurations(robots, np.repeat(drawn[2:, 9:10], 11, axis=1)), np.repeat(went[:, 9:10], 11, axis=1)
+    )
 
 
 @needs_kernel
@@ -214,8 +225,8 @@ def test_exponential_damping_keeps_what_explicit_damping_loses():
     """Full-range first actions on twelve modules: PyElastica's explicit damping loses some of them too."""
     drawn = actions("cable", 1, 16, 12, seed=6)
     explicit, exponential = Fleet("cable", 12, 16, damping="explicit"), Fleet("cable", 12, 16)
-    explicit.run(drawn)
-    exponential.run(drawn)
+    configurations(explicit, drawn)
+    configurations(exponential, drawn)
     assert not explicit.alive.all()
     assert exponential.alive.all()
 
@@ -273,9 +284,9 @@ def test_pyelastica_serves_where_the_kernel_is_missing(monkeypatch, capsys):
     with pytest.raises(ModsoftError, match="make install"):
         Fleet("pneumatic", 2, 3)
     drawn = actions("pneumatic", 2, 3, 2, seed=7)
-    before = robots.run(drawn[:1])
+    before = configurations(robots, drawn[:1])
     robots._arms[1]._rod.velocity_collection[0, 5] = np.inf
-    run = np.concatenate([before, robots.run(drawn[1:])[1:]])
+    run = np.concatenate([before, configurations(robots, drawn[1:])[1:]])
     assert run.shape == (3, 3, 2, 3)
     assert robots.alive.tolist() == [True, False, True]
     assert np.isnan(run[2, 1]).all()

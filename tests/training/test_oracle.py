@@ -8,6 +8,7 @@ from scipy.optimize import lsq_linear
 from modsoft.training.simulation import fleet_kernel, oracle
 from modsoft.training.simulation.fleet import Fleet
 from modsoft.training.simulation.oracle import OracleResult, greedy, improved, oracle_error
+from modsoft.training.simulation.rollout import rollout
 
 pytestmark = [
     pytest.mark.instructions,
@@ -18,11 +19,11 @@ pytestmark = [
 def motion(modules=2, steps=8, seed=0):
     """Configurations (K, N, 3) at the start of each period under actions that wander, from rest: a floor of 0."""
     wander = np.cumsum(np.random.default_rng(seed).uniform(-0.25, 0.25, (steps, 1, modules, 2)), axis=0)
-    return Fleet("cable", modules, 1).run(np.clip(wander, -0.9, 0.9))[:-1, 0]
+    return rollout(Fleet("cable", modules, 1), np.clip(wander, -0.9, 0.9)).configuration[:-1, 0]
 
 
 def errors(desired, actions):
-    reached = Fleet("cable", desired.shape[1], 1).run(actions[:, None])[:-1, 0]
+    reached = rollout(Fleet("cable", desired.shape[1], 1), actions[:, None]).configuration[:-1, 0]
     return 100.0 * np.linalg.norm(reached - desired, axis=-1)
 
 

@@ -1,151 +1,167 @@
-"""The closed loop on a robot whose inverse is known."""
+"""Rollouts on a robot with a known inverse."""
 
 import numpy as np
 import pytest
-import torch
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control import correction, tasks
 from modsoft.runtime.control.features import bending_angle_deg, feature_names, from_angles_deg, state_of
 from modsoft.runtime.errors import ModelError
-from modsoft.training import checkpoint
-from modsoft.training.networks import BiLSTM
-from modsoft.training.simulation import rollout
-from modsoft.training.simulation.rollout import ControllerSetup
+from modsoft.training.simulation import rollout as r
+from modsoft.training.simulation.rollout import ControllerSetup, rollout
 
 pytestmark = pytest.mark.instructions
 
 FULL_DEG = 100.0
+PNEUMATIC_2, PNEUMATIC_3 = robots.load("pneumatic-2"), robots.load("pneumatic-3")
 
 
 class RobotsOfAngles:
-    """Every module bends at once by 100 degrees times its action."""
+    """Every module bends at once by 100 degrees times its action. diverges: robot and step."""
 
-    def __init__(self, modules: int, count: int = 1):
+    def __init__(self, modules: int, count: int = 1, diverges: tuple[int, int] | None = None):
         self.count = count
+        self.alive = np.ones(count, dtype=bool)
         self.configuration = from_angles_deg(np.zeros((count, modules)))
         self.positions = np.zeros((count, modules, 3))
         self.directors = np.tile(np.eye(3), (count, modules, 1, 1))
         self.applied: list[np.ndarray] = []
+        self.periods_s: set[float | None] = set()
+        self._diverges = diverges
 
-    def step(self, actions: np.ndarray, period_s: float) -> None:
-        assert period_s == 0.4
-        self.applied.append(actions)
-        self.configuration = from_angles_deg(FULL_DEG * actions[..., 0])
+    def step(self, actuation: np.ndarray, period_s: float | None = None) -> None:
+        assert np.isfinite(actuation).all()
+        self.applied.append(actuation)
+        self.periods_s.add(period_s)
+        self.configuration = from_angles_deg(FULL_DEG * actuation[..., 0])
+        self.positions, self.directors = self.positions + 1.0, self.directors.copy()
+        if self._diverges is not None and len(self.applied) == self._diverges[1] + 1:
+            self.alive[self._diverges[0]] = False
 
 
-def desired_slot(kind: str, history: int) -> list[int]:
+def desired_columns(kind: str, history: int) -> list[int]:
     names = feature_names(kind, history)
     return [names.index(f"{part}[desired]") for part in ("v_x", "v_y")]
 
 
 def inverse(features: np.ndarray) -> np.ndarray:
-    v_x = features[:, desired_slot("pneumatic", 4)[0]]
+    v_x = features[:, desired_columns("pneumatic", 4)[0]]
     return np.degrees(np.arcsin(v_x))[:, None] / FULL_DEG
 
 
-def test_the_inverse_of_the_robot_is_everywhere_at_the_right_time():
-    robot = robots.load("pneumatic-3")
+def setup(task: str, actuate=inverse, **options) -> ControllerSetup:
+    return ControllerSetup(PNEUMATIC_3, actuate, 4, tasks.task(task, "pneumatic", 3), **options)
+
+
+def test_given_actions_are_applied_and_every_state_is_recorded():
+    actions = np.random.default_rng(0).uniform(-0.9, 0.9, (5, 2, 3, 1))
+    simulator = RobotsOfAngles(3, 2)
+    run = rollout(simulator, actions, period_s=0.2)
+    assert simulator.periods_s == {0.2}
+    np.testing.assert_array_equal(run.actions, actions)
+    np.testing.assert_array_equal(run.configuration[1:], from_angles_deg(FULL_DEG * actions[..., 0]))
+    np.testing.assert_array_equal(run.configuration[0], from_angles_deg(np.zeros((2, 3))))
+    np.testing.assert_array_equal(run.positions[:, 0, 0, 0], np.arange(6.0))
+    assert run.directors.shape == (6, 2, 3, 3, 3)
+    for b, single in enumerate(run.robots()):
+        np.testing.assert_array_equal(single.configuration, run.configuration[:, b])
+        np.testing.assert_array_equal(single.actions, actions[:, b])
+
+
+def test_diverged_robot_is_nan_from_the_end_of_that_period():
+    run = rollout(RobotsOfAngles(3, 2, diverges=(1, 2)), np.zeros((5, 2, 3, 1)))
+    for values in (run.configuration, run.positions, run.directors):
+        assert np.isfinite(values[:, 0]).all()
+        assert np.isfinite(values[:3, 1]).all()
+        assert np.isnan(values[3:, 1]).all()
+
+
+def test_controller_of_a_diverged_robot_holds_its_actuation_and_the_others_continue():
+    simulator = RobotsOfAngles(3, 2, diverges=(0, 2))
+    diverged, other = rollout(simulator, [setup("edge"), setup("edge")]).robots()
+    (alone,) = rollout(RobotsOfAngles(3), [setup("edge")]).robots()
+    np.testing.assert_array_equal(other.configuration, alone.configuration)
+    np.testing.assert_array_equal(diverged.actions[:3], alone.actions[:3])
+    assert (diverged.actions[3:] == diverged.actions[2]).all()
+
+
+def test_inverse_of_the_robot_follows_the_task_without_delay():
     desired = tasks.task("edge", "pneumatic", 3)
-    (flight,) = rollout.rollout(robot, RobotsOfAngles(3), [ControllerSetup(inverse, 4, desired)])
-    assert flight.configuration.shape == (201, 3, 3)
-    assert flight.actions.shape == (200, 3, 1)
-    assert (flight.positions.shape, flight.directors.shape) == ((201, 3, 3), (201, 3, 3, 3))
-    errors = rollout.angle_errors_deg(flight.configuration, desired)
+    simulator = RobotsOfAngles(3)
+    (run,) = rollout(simulator, [setup("edge")]).robots()
+    assert simulator.periods_s == {PNEUMATIC_3.loop.period_s}
+    assert run.configuration.shape == (201, 3, 3)
+    assert run.actions.shape == (200, 3, 1)
+    assert (run.positions.shape, run.directors.shape) == ((201, 3, 3), (201, 3, 3, 3))
+    errors = r.angle_errors_deg(run.configuration, desired)
     assert errors.shape == (200, 3)
     np.testing.assert_allclose(errors, 0.0, atol=1e-9)
-    # one period late it is off by what the task moves: 90 degrees in 50 steps at the tip
-    late = rollout.configuration_errors_percent(flight.configuration[:-1], desired[1:])
+    # One period later the error is the motion of the task in a step: 90 degrees in 50 steps at the tip.
+    late = r.configuration_errors_percent(run.configuration[:-1], desired[1:])
     np.testing.assert_allclose(late[:, 2], 200 * np.sin(np.radians(0.9)), atol=1e-9)
 
 
-def test_the_controller_is_fed_as_by_the_runtime_and_held_to_the_largest_step():
-    robot = robots.load("pneumatic-2")
+def test_features_are_those_of_the_runtime_and_the_largest_step_is_kept():
     seen = []
 
-    def controller(features):
+    def policy(features):
         seen.append(features)
         return np.array([[2.9], [-0.3]])
 
-    arms = RobotsOfAngles(2)
+    simulator = RobotsOfAngles(2)
     desired = from_angles_deg(np.outer(np.arange(5), [10.0, 20.0]))
-    (flight,) = rollout.rollout(robot, arms, [ControllerSetup(controller, 4, desired)])
-    largest = robot.limits.largest_actuation_step
-    np.testing.assert_allclose(flight.actions[:, 0, 0], np.minimum(1.0, largest * np.arange(1, 6)))
-    np.testing.assert_allclose(flight.actions[:, 1, 0], -0.3)
-    np.testing.assert_array_equal(np.stack(arms.applied)[:, 0], flight.actions)
+    (run,) = rollout(simulator, [ControllerSetup(PNEUMATIC_2, policy, 4, desired)]).robots()
+    largest = PNEUMATIC_2.limits.largest_actuation_step
+    np.testing.assert_allclose(run.actions[:, 0, 0], np.minimum(1.0, largest * np.arange(1, 6)))
+    np.testing.assert_allclose(run.actions[:, 1, 0], -0.3)
+    np.testing.assert_array_equal(np.stack(simulator.applied)[:, 0], run.actions)
     names = feature_names("pneumatic", 4)
     for k, features in enumerate(seen):
         np.testing.assert_array_equal(
-            features[:, desired_slot("pneumatic", 4)], state_of(desired[min(k + 1, 4)], "pneumatic"), strict=True
+            features[:, desired_columns("pneumatic", 4)], state_of(desired[min(k + 1, 4)], "pneumatic"), strict=True
         )
-        np.testing.assert_array_equal(features[:, names.index("v_x[t]")], flight.configuration[k][:, 0])
-        # what was applied, not what was asked for
-        before = flight.actions[k - 1, :, 0] if k else np.zeros(2)
+        np.testing.assert_array_equal(features[:, names.index("v_x[t]")], run.configuration[k][:, 0])
+        # The applied actuation, not the output of the policy.
+        before = run.actions[k - 1, :, 0] if k else np.zeros(2)
         np.testing.assert_array_equal(features[:, names.index("a_0[t-1]")], before)
 
 
-def test_robots_fly_side_by_side_each_with_its_own_pilot():
-    robot = robots.load("pneumatic-3")
-    references = [tasks.task(name, "pneumatic", 3) for name in ("edge", "down")]
-    together = rollout.rollout(
-        robot, RobotsOfAngles(3, 2), [ControllerSetup(inverse, 4, desired) for desired in references]
-    )
-    for flight, desired in zip(together, references, strict=True):
-        (alone,) = rollout.rollout(robot, RobotsOfAngles(3), [ControllerSetup(inverse, 4, desired)])
-        np.testing.assert_array_equal(flight.configuration, alone.configuration)
-    with pytest.raises(ValueError, match="1 pilots for 2 robots"):
-        rollout.rollout(robot, RobotsOfAngles(3, 2), [ControllerSetup(inverse, 4, references[0])])
+def test_each_robot_has_its_own_controller_and_task():
+    names = ("edge", "down")
+    runs = rollout(RobotsOfAngles(3, 2), [setup(name) for name in names]).robots()
+    for run, name in zip(runs, names, strict=True):
+        (alone,) = rollout(RobotsOfAngles(3), [setup(name)]).robots()
+        np.testing.assert_array_equal(run.configuration, alone.configuration)
+    with pytest.raises(ValueError, match="1 controller setups for 2 robots"):
+        rollout(RobotsOfAngles(3, 2), [setup("edge")])
 
 
-def test_a_lost_frame_holds_the_action():
-    robot = robots.load("pneumatic-3")
-    desired = tasks.task("edge", "pneumatic", 3)
-    lost = ControllerSetup(
-        inverse, 4, desired, measure=lambda step, configuration: None if step == 10 else configuration
-    )
-    (flight,) = rollout.rollout(robot, RobotsOfAngles(3), [lost])
-    np.testing.assert_array_equal(flight.actions[10], flight.actions[9])
-    assert np.all(flight.actions[11] != flight.actions[10])
+def test_lost_frame_holds_the_action():
+    measure = lambda step, configuration: None if step == 10 else configuration  # noqa: E731
+    (run,) = rollout(RobotsOfAngles(3), [setup("edge", measure=measure)]).robots()
+    np.testing.assert_array_equal(run.actions[10], run.actions[9])
+    assert np.all(run.actions[11] != run.actions[10])
 
 
-def test_a_correction_takes_off_what_the_network_is_wrong_by():
-    robot = robots.load("pneumatic-3")
-    desired = tasks.task("down", "pneumatic", 3)  # no further than 90 degrees, where v_x tells the angle
-
-    def wrong(features):
+def test_correction_removes_a_constant_error_of_the_policy():
+    def biased(features):
         return inverse(features) + 0.03
 
-    pilots = [ControllerSetup(wrong, 4, desired), ControllerSetup(wrong, 4, desired, correction.named("integral", 3))]
-    alone, corrected = rollout.rollout(robot, RobotsOfAngles(3, 2), pilots)
-    np.testing.assert_allclose(rollout.angle_errors_deg(alone.configuration, desired)[1:], 3.0, atol=1e-6)
-    assert rollout.angle_errors_deg(corrected.configuration, desired)[20:].max() < 0.1
+    # Task "down" stays within 90 degrees, where v_x determines the angle.
+    desired = tasks.task("down", "pneumatic", 3)
+    setups = [setup("down", biased), setup("down", biased, correction=correction.named("integral", 3))]
+    alone, corrected = rollout(RobotsOfAngles(3, 2), setups).robots()
+    np.testing.assert_allclose(r.angle_errors_deg(alone.configuration, desired)[1:], 3.0, atol=1e-6)
+    assert r.angle_errors_deg(corrected.configuration, desired)[20:].max() < 0.1
 
 
-def test_angles_are_compared_the_short_way_round():
+def test_angle_error_is_the_shorter_of_the_two_ways():
     configuration = from_angles_deg(np.array([[170.0]]))
     desired = from_angles_deg(np.array([[-170.0]]))
-    np.testing.assert_allclose(rollout.angle_errors_deg(configuration, desired), [[20.0]])
+    np.testing.assert_allclose(r.angle_errors_deg(configuration, desired), [[20.0]])
     np.testing.assert_allclose(bending_angle_deg(desired), [[-170.0]])
 
 
-def test_a_checkpoint_becomes_a_controller_of_any_module_number():
-    torch.manual_seed(0)
-    network = BiLSTM(13, 1, layers=2, hidden=4).eval()
-    sizes = {"name": "bilstm", "feature_size": 13, "action_size": 1, "layers": 2, "hidden": 4, "history": 4}
-    actuate = rollout.actuate_with({"network": sizes, "weights": network.state_dict()})
-    assert checkpoint.network_of({"network": sizes, "weights": network.state_dict()}) is not network
-    for modules in (2, 5):
-        features = np.random.default_rng(modules).normal(size=(modules, 13))
-        with torch.no_grad():
-            expected = network(torch.tensor(features, dtype=torch.float32)[None])[0].numpy()
-        np.testing.assert_allclose(actuate(features), expected, atol=1e-6)
-
-
-def test_an_answer_that_the_runtime_refuses_is_refused_in_a_rollout_too():
-    robot = robots.load("pneumatic-2")
-    desired = from_angles_deg(np.zeros((5, 2)))
+def test_actuation_far_out_of_range_is_refused_as_by_the_runtime():
     with pytest.raises(ModelError, match="never beyond 3"):
-        rollout.rollout(
-            robot, RobotsOfAngles(2), [ControllerSetup(lambda features: np.array([[3.1], [0.0]]), 4, desired)]
-        )
+        rollout(RobotsOfAngles(3), [setup("edge", lambda features: np.array([[3.1], [0.0], [0.0]]))])

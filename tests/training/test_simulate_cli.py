@@ -7,8 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from modsoft.runtime.errors import OutputError, UsageError
+from modsoft.runtime.errors import ModsoftError, OutputError, UsageError
 from modsoft.training import simulate_cli
+from modsoft.training.simulation import elastica
 
 
 @pytest.fixture(name="run")
@@ -73,6 +74,25 @@ def test_a_missing_or_damaged_actions_file_is_one_line_and_65(tmp_path, run, con
     assert code == 65
     assert str(path) in err
     assert err.count("\n") == 1
+
+
+def test_diverging_simulation_is_one_line_that_names_the_step(tmp_path, run, monkeypatch):
+    step = elastica.Arm.step
+
+    def diverging(self, action, period_s):
+        if action[0, 0] == 0.75:
+            raise ModsoftError("diverged")
+        return step(self, action, period_s)
+
+    monkeypatch.setattr(elastica.Arm, "step", diverging)
+    actions = np.zeros((3, 2, 1))
+    actions[1, 0] = 0.75
+    np.save(tmp_path / "a.npy", actions)
+    code, err = run("--robot", "pneumatic-2", "--actions", tmp_path / "a.npy", "--out", tmp_path / "run.npz")
+    assert code == ModsoftError.exit_code
+    assert "pneumatic-2 diverges under the action of step 1" in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "run.npz").exists()
 
 
 def test_an_unknown_robot_is_64(tmp_path, run):

@@ -33,13 +33,14 @@ def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]
     for task, each in flown:
         desired = tasks.task(task, kind, robot.modules)[:steps]
         pilots.append(
-            ControllerSetup(controller.actuate, controller.history, desired, correction.named(each, robot.modules))
+            ControllerSetup(
+                robot, controller.actuate, controller.history, desired, correction.named(each, robot.modules)
+            )
         )
     errors = angle_errors_deg if kind == "pneumatic" else configuration_errors_percent
     rows: list[dict[str, object]] = []
-    for (task, each), pilot, flight in zip(
-        flown, pilots, rollout(robot, simulated(kind, robot.modules, len(pilots)), pilots), strict=True
-    ):
+    rollouts = rollout(simulated(kind, robot.modules, len(pilots)), pilots).robots()
+    for (task, each), pilot, flight in zip(flown, pilots, rollouts, strict=True):
         mean = errors(flight.configuration, pilot.desired).mean(axis=0)
         unit = "degrees" if kind == "pneumatic" else "percent"
         rows.append(

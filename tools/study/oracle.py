@@ -14,7 +14,7 @@ from modsoft.study.paths import Folder
 from modsoft.study.plan import Plan
 from modsoft.study.scheduler import Stage, Told
 from modsoft.training.simulation.fleet import simulated
-from modsoft.training.simulation.rollout import Rollout
+from modsoft.training.simulation.rollout import Rollout, rollout
 
 STEP_S = 0.35  # of one core, for a control step of four modules, about
 
@@ -49,10 +49,4 @@ def _find(plan: Plan, folder: Folder, each: tuple[str, int], told: Told) -> None
 
 def replay(modules: int, actions: Array) -> Rollout:
     """What a robot at rest does under actions (K, N, A)."""
-    fleet = simulated("cable", modules, 1)
-    told = [(fleet.configuration[0], fleet.positions[0], fleet.directors[0])]
-    for action in actions:
-        fleet.step(action[None])
-        told.append((fleet.configuration[0], fleet.positions[0], fleet.directors[0]))
-    configuration, positions, directors = (np.stack(values) for values in zip(*told, strict=True))
-    return Rollout(configuration, np.asarray(actions), positions, directors)
+    return rollout(simulated("cable", modules, 1), actions[:, None]).robots()[0]

@@ -120,6 +120,7 @@ def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: Told) -> 
         each.check(robot)
     pilots = [
         ControllerSetup(
+            robot,
             models[run.model].actuate,
             models[run.model].history,
             desired_of(plan, run.task, run.modules),
@@ -131,7 +132,7 @@ def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: Told) -> 
     variant = perturbations.plant(first.disturbance, first.modules, first.model.seed)
     flown = simulated("cable", first.modules, len(batch), **variant)
     seals = {model: stages.seal(folder, model) for model in models}
-    for run, pilot, flight in zip(batch, pilots, rollout(robot, flown, pilots), strict=True):
+    for run, pilot, flight in zip(batch, pilots, rollout(flown, pilots).robots(), strict=True):
         if not np.isfinite(flight.configuration).all():
             raise ModelError(f"{run.name}: the simulated robot flew apart; no number is made of this run")
         keep(folder.run(run), identity(plan, run, seals[run.model]), flight, pilot.desired)

@@ -161,10 +161,6 @@ class Fleet:
         self._set(self._drive, actuation)
         self._advance(self._constants, self._state, self._drive, self.plant.period_s if period_s is None else period_s)
 
-    def run(self, actions: Array) -> Array:
-        """Applies actions (K, B, N, A), a control period each; configurations (K + 1, B, N, 3)."""
-        return _run(self, actions)
-
     def _with_arrays(self, damping: Damping) -> fleet_kernel.PlantStruct:
         plant = fleet_kernel.constants(self.plant, damping, self.time_step_s)
         plant.mobility = self._mobility.ctypes.data
@@ -255,11 +251,11 @@ class Arms:
 
     @property
     def positions(self) -> Array:
-        return self._of_the_living(np.stack([arm.positions for arm in self._arms]))
+        return np.stack([arm.positions for arm in self._arms])
 
     @property
     def directors(self) -> Array:
-        return self._of_the_living(np.stack([arm.directors for arm in self._arms]))
+        return np.stack([arm.directors for arm in self._arms])
 
     def reset(self, indices: Sequence[int] | NDArray[np.integer] | None = None) -> None:
         for index in range(self.count) if indices is None else indices:
@@ -273,21 +269,6 @@ class Arms:
                     arm.step(actuation[index], period_s)
                 except ModsoftError:
                     self.alive[index] = False
-
-    def run(self, actions: Array) -> Array:
-        return _run(self, actions)
-
-    def _of_the_living(self, values: Array) -> Array:
-        values[~self.alive] = np.nan
-        return values
-
-
-def _run(robots: Fleet | Arms, actions: Array) -> Array:
-    configuration = [robots.configuration]
-    for action in actions:
-        robots.step(action)
-        configuration.append(robots.configuration)
-    return np.stack(configuration)
 
 
 def simulated(

@@ -21,7 +21,7 @@ from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.errors import ModsoftError
 from modsoft.runtime.robot import KINDS
 from modsoft.training.simulation.fleet import Fleet, Snapshot
-from modsoft.training.simulation.rollout import configuration_errors_percent
+from modsoft.training.simulation.rollout import configuration_errors_percent, rollout
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def oracle_error(kind: str, modules: int, desired: Array, *, seed: int = 0) -> O
     seed: of the guesses that Gauss-Newton's first one competes with. `ModsoftError` if no action keeps the robot whole.
     """
     actions = improved(kind, modules, desired, greedy(kind, modules, desired, seed=seed))
-    reached = Fleet(kind, modules, 1).run(actions[:, None])[:, 0]
+    reached = rollout(Fleet(kind, modules, 1), actions[:, None]).configuration[:, 0]
     return OracleResult(actions, configuration_errors_percent(reached, desired))
 
 
@@ -133,7 +133,7 @@ def improved(kind: str, modules: int, desired: Array, actions: Array, *, sweeps:
         shares = 0.5 ** np.arange(robots.count)[:, None, None]
         trials = np.clip(actions[:, None] + shares * step.reshape(actions[:, None].shape), -1.0, 1.0)
         robots.reset()
-        reached = robots.run(trials)[1:]
+        reached = rollout(robots, trials).configuration[1:]
         sums = np.linalg.norm(reached - targets[:, None], axis=-1)[:-1].sum(axis=(0, 2))
         best = int(np.nanargmin(sums))
         if not sums[best] < (1.0 - ENOUGH_OF_ALL) * error:

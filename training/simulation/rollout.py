@@ -1,13 +1,12 @@
-"""What a controller is worth: simulated robots in closed loop, and their distance from what was desired."""
+"""Rollouts: simulated robots under given actions or in closed loop with controllers, and the errors that remain."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from modsoft.runtime.control.controller import Controller
@@ -15,28 +14,43 @@ from modsoft.runtime.control.correction import Correction, NoCorrection
 from modsoft.runtime.control.features import bending_error_deg
 from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.robot import Robot
-from modsoft.training.checkpoint import network_of
-from modsoft.training.simulation.fleet import Arms, Fleet
 
 Array = NDArray[np.float64]
 Actuate = Callable[[Array], Array]
 Measure = Callable[[int, Array], Array | None]
 
 
+class Robots(Protocol):
+    """Simulated robots that advance together: `fleet.Fleet`, or `fleet.Arms`."""
+
+    count: int
+
+    @property
+    def configuration(self) -> Array: ...
+    @property
+    def positions(self) -> Array: ...
+    @property
+    def directors(self) -> Array: ...
+    @property
+    def alive(self) -> NDArray[np.bool_]: ...
+    def step(self, actuation: Array, period_s: float | None = None) -> None: ...
+
+
 def exactly(step: int, configuration: Array) -> Array | None:
-    """A tracker without fault."""
+    """A `Measure` without error."""
     return configuration
 
 
 @dataclass
 class ControllerSetup:
-    """Who drives one robot of a fleet through one task.
+    """The controller of one simulated robot, and its task.
 
     actuate: features (N, F) -> actuation (N, A); desired (K, N, 3): configurations at the start of each period.
-    measure: (step, true configuration (N, 3)) -> what the tracker says, or None for a lost frame, on which the runtime
-    holds the action and remembers the state before.
+    measure: (step, true configuration (N, 3)) -> the measured one, or None for a lost frame. The controller then holds
+    the actuation, as on the real robot.
     """
 
+    robot: Robot
     actuate: Actuate
     history: int
     desired: Array
@@ -45,51 +59,86 @@ class ControllerSetup:
 
 
 class Rollout(NamedTuple):
-    """What one robot did: at the start of every period and after the last, and the actions that were applied."""
+    """The states of B robots at the start of each of K periods and after the last, and the actions in between.
 
-    configuration: Array  # (K + 1, N, 3)
-    actions: Array  # (K, N, A)
-    positions: Array  # (K + 1, N, 3), m, of the module ends
-    directors: Array  # (K + 1, N, 3, 3), rows d1, d2, d3 in the lab frame
+    A robot that diverges is NaN in all states from the end of that period on; its actions stay finite. The rollout of
+    one robot (`robots`) has no axis B.
+    """
 
+    configuration: Array  # (K + 1, B, N, 3), [v_x, v_y, v_z]
+    actions: Array  # (K, B, N, A)
+    positions: Array  # (K + 1, B, N, 3), m, of the module ends
+    directors: Array  # (K + 1, B, N, 3, 3), rows d1, d2, d3 in the lab frame
 
-def rollout(robot: Robot, robots: Fleet | Arms, pilots: Sequence[ControllerSetup]) -> list[Rollout]:
-    """Drives `robots`, at rest, each by its own pilot as the runtime would (`modsoft.runtime.loop`): at step k the
-    network is asked for desired[k + 1], the state at the end of the period. All tasks have the same length K."""
-    steps = len(pilots[0].desired)
-    if len(pilots) != robots.count or any(len(pilot.desired) != steps for pilot in pilots):
-        raise ValueError(f"{len(pilots)} pilots for {robots.count} robots; expected one each, of tasks of one length")
-    actions = np.zeros((steps, len(pilots), robot.modules, robot.action_size))
-    states = [(robots.configuration, robots.positions, robots.directors)]
-    controllers = [
-        Controller(robot, pilot, rest, pilot.correction) for pilot, rest in zip(pilots, states[0][0], strict=True)
-    ]
-    targets = [next_reference(pilot.desired) for pilot in pilots]
-    for k in range(steps):
-        for b, (pilot, controller) in enumerate(zip(pilots, controllers, strict=True)):
-            measured = pilot.measure(k, states[-1][0][b])
-            actions[k, b] = controller.compute(measured, pilot.desired[k], targets[b][k])
-            controller.record(actions[k, b])
-        robots.step(actions[k], robot.loop.period_s)
-        states.append((robots.configuration, robots.positions, robots.directors))
-    configuration, positions, directors = (np.stack(values, axis=1) for values in zip(*states, strict=True))
-    return [Rollout(configuration[b], actions[:, b], positions[b], directors[b]) for b in range(len(pilots))]
+    def robots(self) -> list[Rollout]:
+        """The rollout of each robot."""
+        return [Rollout(*(values[:, b] for values in self)) for b in range(self.actions.shape[1])]
 
 
-def actuate_with(checkpoint: dict[str, Any]) -> Actuate:
-    """The checkpoint's network as a controller: features (N, F) -> actuation (N, A)."""
-    network = network_of(checkpoint)
+def rollout(simulator: Robots, source: Array | Sequence[ControllerSetup], *, period_s: float | None = None) -> Rollout:
+    """Advances the robots of `simulator` by one control period for each action.
 
-    def actuate(features: Array) -> Array:
-        with torch.no_grad():
-            return network(torch.from_numpy(features.astype(np.float32))[None])[0].double().numpy()
+    source: actions (K, B, N, A), or one controller setup for each robot. A controller computes its action as on the
+    real robot (`Controller`): at step k its target is desired[k + 1], the state at the end of the period. All tasks
+    have the same length K, and the robots start at rest.
+    period_s: the simulator's own control period by default; with controllers that of the robot file.
+    """
+    if isinstance(source, np.ndarray):
+        actions, choose = source, lambda step, state: source[step]
+    else:
+        controllers = _Controllers(simulator, source)
+        actions, choose, period_s = controllers.actions, controllers.compute, source[0].robot.loop.period_s
+    states = [_state(simulator)]
+    for step in range(len(actions)):
+        simulator.step(choose(step, states[-1][0]), period_s)
+        states.append(_state(simulator))
+    configuration, positions, directors = (np.stack(values) for values in zip(*states, strict=True))
+    return Rollout(configuration, np.asarray(actions), positions, directors)
 
-    return actuate
+
+def _state(simulator: Robots) -> tuple[Array, Array, Array]:
+    state = simulator.configuration, simulator.positions, simulator.directors
+    diverged = ~simulator.alive
+    for values in state:
+        values[diverged] = np.nan  # a divergence in the middle of a rod does not show at the module ends yet
+    return state
+
+
+class _Controllers:
+    """One controller for each robot; keeps the actions (K, B, N, A)."""
+
+    def __init__(self, simulator: Robots, setups: Sequence[ControllerSetup]) -> None:
+        steps = len(setups[0].desired)
+        if len(setups) != simulator.count or any(len(setup.desired) != steps for setup in setups):
+            raise ValueError(
+                f"found {len(setups)} controller setups for {simulator.count} robots, expected one for each robot, "
+                "with tasks of the same length"
+            )
+        robot = setups[0].robot
+        self.actions = np.zeros((steps, len(setups), robot.modules, robot.action_size))
+        self._setups = setups
+        self._controllers = [
+            Controller(setup.robot, setup, rest, setup.correction)
+            for setup, rest in zip(setups, simulator.configuration, strict=True)
+        ]
+        self._targets = [next_reference(setup.desired) for setup in setups]
+
+    def compute(self, step: int, configuration: Array) -> Array:
+        """The actions (B, N, A) of a step, for the configurations (B, N, 3) at its start."""
+        actions = self.actions[step]
+        for b, (setup, controller) in enumerate(zip(self._setups, self._controllers, strict=True)):
+            is_alive = bool(np.isfinite(configuration[b]).all())
+            measured = setup.measure(step, configuration[b]) if is_alive else None
+            actions[b] = controller.compute(measured, setup.desired[step], self._targets[b][step])
+            controller.record(actions[b])
+        return actions
 
 
 def angle_errors_deg(configuration: Array, desired: Array) -> Array:
-    """|bending angle - desired bending angle| (K, N), degrees, of a planar robot: configuration (K + 1, N, 3) at the
-    start of period k against the desired one of step k, as the paper counts it."""
+    """|bending angle - desired bending angle| (K, N), degrees, of a planar robot.
+
+    configuration (K + 1, N, 3): the one at the start of period k is compared with desired[k], as in the paper.
+    """
     return bending_error_deg(configuration[: len(desired)], desired)
 
 

@@ -13,6 +13,7 @@ from modsoft.runtime.robot import Robot
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.fleet import Arms, Fleet
 from modsoft.training.simulation.parameters import PASCAL_PER_BAR, PLANTS
+from modsoft.training.simulation.rollout import rollout
 
 Array = NDArray[np.float64]
 
@@ -80,13 +81,7 @@ def _overrides(perturbation: Perturbation | None) -> dict[str, Any]:
 
 
 def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:
-    configuration = [robots.configuration]
-    for action in np.moveaxis(actions, 1, 0):
-        robots.step(action, period_s)
-        reached = robots.configuration
-        reached[~robots.alive] = np.nan  # what was lost in the middle may not show at the module ends yet
-        configuration.append(reached)
-    return np.stack(configuration, axis=1)
+    return np.moveaxis(rollout(robots, np.moveaxis(actions, 1, 0), period_s=period_s).configuration, 0, 1)
 
 
 def _check(robot: Robot) -> None:
