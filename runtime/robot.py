@@ -74,12 +74,19 @@ class Chamber(Section, frozen=True):
 
 
 class Limits(Section, frozen=True):
-    """`[limits]`: what the loop never exceeds, and how long it goes on without a good frame."""
+    """`[limits]`: what the loop never exceeds, which frames are invalid, and how many of them in a row end a run.
 
-    largest_actuation_step: Annotated[float, Meta(gt=0.0, le=2.0)] = 2.0
+    `largest_actuation_step` also bounds the plausible motion between two frames. `largest_rms_mm` is the largest
+    quality value of a tool (NDI: RMS error, mm). A tool is invalid with any bit of `refused_port_status` set (NDI: 0x40
+    out of volume, 0x80 partially, the others errors of sensor or processing).
+    """
+
+    largest_actuation_step: Annotated[float, Meta(gt=0.0, le=2.0)] = 0.4
     slew_bar_per_s: Annotated[float, Meta(gt=0.0, le=50.0)] = 2.0
     tracker_age_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.4
     invalid_frames: Annotated[int, Meta(ge=1, le=100)] = 3
+    largest_rms_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    refused_port_status: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0xD3C0
 
 
 class Tracker(Section, frozen=True):

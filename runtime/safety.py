@@ -21,13 +21,19 @@ MISSED_IN_A_ROW = 2  # skipped ticks that are waited out; the board's own timer 
 RAW_LIMIT = 3.0  # the actuation runs from -1 to 1: a network that answers this far out extrapolates
 BASELINE_S = 60.0  # over which the device's count is compared with the host's clock: 100 ppm make 6 ms of it
 NOISE_DEG = 5.0  # marker noise on top of the fastest motion
+CONFIRMING_FRAMES = 3  # valid frames in a row that agree with a jump before it is accepted
 STRETCH = 1.3  # a module's end is never further from the end before it than at rest, but for this
 STRETCH_MM = 10.0
 BEHIND = 0.25  # of its distance at rest: no bent module's end gets so far behind the end before it
 SIZE_TOLERANCE = 0.02  # of the length of a rotation's third axis
+# Bits of NDI's port status.
+PORT_IN_USE = 0x30  # initialised and enabled
+PORT_OUT_OF_VOLUME = 0x40
+PORT_ERRORS = {0x80: "partially out of volume", 0x100: "sensor or algorithm", 0x200: "infrared interference"}
 
 # Why a frame is not used. With the first group the tracker is as good as gone.
 NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED = "no frame", "stale", "frozen", "backwards", "delayed"
+OUT_OF_VOLUME, PORT_ERROR, INACCURATE = "out of volume", "port status", "RMS error"
 WRONG_NUMBER, HIDDEN, NOT_FINITE, DISTORTED = "wrong number of tools", "tool hidden", "not finite", "distorted"
 SWAPPED, REVERSED, JUMP = "tools too far apart", "tools in a wrong order", "jump"
 GOOD = "good"
@@ -51,7 +57,9 @@ class FrameValidator:
     """Judges the newest frame at every tick; remembers the last good one.
 
     The gate on jumps: over the whole range of the actuation a module bends through half a turn at most, twice that for
-    the swing, so in one period it moves by 180 degrees times the largest actuation step at most.
+    the swing, so in one period it moves by 180 degrees times the largest actuation step at most. Without a valid frame
+    the command is held, so that a longer gap allows no more. A pose beyond the gate is accepted after
+    `CONFIRMING_FRAMES` more valid frames in a row, each within the gate of the one before.
     """
 
     def __init__(self, robot: Robot):
@@ -59,6 +67,7 @@ class FrameValidator:
         self._deg_per_s = 180.0 * robot.limits.largest_actuation_step / robot.loop.period_s
         self._used: TrackerFrame | None = None
         self._used_configuration: Array | None = None
+        self._jumped: list[tuple[TrackerFrame, Array]] = []  # a jump and the frames that confirm it
         self._rest_mm: list[float] | None = None
         self._offsets: deque[tuple[float, float]] = deque()  # (host's time, host's time - device's time)
 
@@ -70,6 +79,10 @@ class FrameValidator:
         word, detail, configuration = self._order(frame, age_s)
         if word == GOOD:
             word, detail, configuration = self.content(frame)
+        if word == GOOD and configuration is not None:
+            word, detail = self._continuity(frame, configuration)
+        else:
+            self._jumped.clear()
         if word != GOOD:
             return FrameCheck(word, None, age_s, detail)
         if self._rest_mm is None:
@@ -110,6 +123,18 @@ class FrameValidator:
             return WRONG_NUMBER, f"{len(frame.poses)}, expected {count}", None
         if not frame.valid.all():
             return HIDDEN, _tool_name(int(np.argmin(frame.valid))), None
+        if frame.port_status is not None:
+            for tool, port_status in enumerate(frame.port_status):
+                refused = port_status & self.robot.limits.refused_port_status
+                if refused & PORT_OUT_OF_VOLUME:
+                    return OUT_OF_VOLUME, _tool_name(tool), None
+                if refused or port_status & PORT_IN_USE != PORT_IN_USE:
+                    causes = [name for bit, name in PORT_ERRORS.items() if refused & bit]
+                    return PORT_ERROR, ", ".join([f"{_tool_name(tool)} {port_status:#x}", *causes]), None
+        if (frame.quality > self.robot.limits.largest_rms_mm).any():  # NaN: not measured
+            worst = int(np.nanargmax(frame.quality))
+            limit_mm = self.robot.limits.largest_rms_mm
+            return INACCURATE, f"{_tool_name(worst)} {frame.quality[worst]:.2f} mm, at most {limit_mm:g} mm", None
         if not np.isfinite(frame.poses).all():
             return NOT_FINITE, _tool_name(int(np.argmin(np.isfinite(frame.poses).all(axis=(1, 2))))), None
         configuration = from_poses(frame.poses)
@@ -123,19 +148,40 @@ class FrameValidator:
             if max(over) > 0:
                 worst = int(np.argmax(over))
                 return SWAPPED, f"{_tool_name(worst)} and {_tool_name(worst + 1)}", None
-        if self._used is not None and self._used_configuration is not None:
-            moved = angle_between_deg(configuration, self._used_configuration)
-            allowed = self._deg_per_s * (frame.monotonic_s - self._used.monotonic_s) + NOISE_DEG
-            if moved.max() > allowed:
-                worst = int(np.argmax(moved))
-                return JUMP, f"module {worst + 1} by {moved[worst]:.0f} degrees, at most {allowed:.0f}", None
-        if self._rest_mm is not None:
             pairs = zip(_ahead_mm(frame.poses), self._rest_mm[1:], strict=True)
             behind = [-ahead > BEHIND * rest for ahead, rest in pairs]
             if any(behind):  # all distances are those of a robot whose tools are told from tip to base
                 first = behind.index(True) + 1
                 return REVERSED, f"{_tool_name(first + 1)} behind {_tool_name(first)}", None
         return GOOD, "", configuration
+
+    def _continuity(self, frame: TrackerFrame, configuration: Array) -> tuple[str, str]:
+        """Whether the robot can have moved like this since the last frame that was used."""
+        if self._used is None or self._used_configuration is None:
+            return GOOD, ""
+        detail = self._jump(self._used, self._used_configuration, frame, configuration)
+        if not detail:
+            self._jumped.clear()
+            return GOOD, ""
+        if self._jumped and self._jump(*self._jumped[-1], frame, configuration):
+            self._jumped.clear()
+        self._jumped.append((frame, configuration))
+        if len(self._jumped) <= CONFIRMING_FRAMES:
+            return JUMP, detail
+        self._jumped.clear()
+        return GOOD, ""
+
+    def _jump(
+        self, before: TrackerFrame, configuration_before: Array, frame: TrackerFrame, configuration: Array
+    ) -> str:
+        """Which module moved too far between two frames, and how far; empty if none did."""
+        moved = angle_between_deg(configuration, configuration_before)
+        passed_s = min(frame.monotonic_s - before.monotonic_s, self.robot.loop.period_s)
+        allowed = self._deg_per_s * passed_s + NOISE_DEG
+        worst = int(np.argmax(moved))
+        return (
+            f"module {worst + 1} by {moved[worst]:.0f} degrees, at most {allowed:.0f}" if moved[worst] > allowed else ""
+        )
 
 
 class FaultCounter:

@@ -18,6 +18,7 @@ class TrackerFrame:
     """What the tracker measured at one instant: the tool of the base and those at the module ends, in the tracker's
     own coordinate frame.
 
+    port_status: NDI's port status of each tool (Polaris API guide, reply to TX), None where a source has none.
     device_frame: the device's frame number, which orders frames. monotonic_s: taken before the request to the device,
     so that an age computed from it is never too small. device_hz: frame rate of the device, None if unknown.
     """
@@ -28,6 +29,7 @@ class TrackerFrame:
     valid: NDArray[np.bool_]  # (N + 1,), False for a tool that was not seen
     quality: Array  # (N + 1,), the device's own measure (NDI: RMS error, mm), NaN where there is none
     device_hz: float | None = None
+    port_status: tuple[int, ...] | None = None  # N + 1
 
 
 class Source(Protocol):

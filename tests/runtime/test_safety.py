@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
+from modsoft.runtime import robot as robots
 from modsoft.runtime import safety
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
@@ -58,6 +59,9 @@ BAD = {
     safety.SWAPPED: lambda: frame(6024, 100.39, poses=planar_poses((0.0, 10.0, 20.0))[[0, 2, 1, 3]]),
     safety.REVERSED: lambda: frame(6024, 100.39, poses=planar_poses((0.0, 10.0, 20.0))[::-1]),
     safety.JUMP: lambda: frame(6024, 100.39, (0.0, 0.0, 120.0)),
+    safety.OUT_OF_VOLUME: lambda: frame(6024, 100.39, port_status=(0x31, 0x31, 0x71, 0x31)),
+    safety.PORT_ERROR: lambda: frame(6024, 100.39, port_status=(0x31, 0x31, 0x1031, 0x31)),
+    safety.INACCURATE: lambda: frame(6024, 100.39, quality=np.array([0.1, 0.1, 1.01, 0.1])),
 }
 
 
@@ -71,9 +75,102 @@ def test_each_bad_frame_is_refused_by_name(word):
     assert judge.judge(frame(6072, 101.19), 101.2).good
 
 
-@pytest.mark.parametrize(("word", "name"), [(safety.HIDDEN, "module 2"), (safety.NOT_FINITE, "module 2")])
-def test_the_tool_is_named(word, name):
-    assert settled().judge(BAD[word](), 100.4).detail == name
+@pytest.mark.parametrize(
+    ("word", "detail"),
+    [
+        (safety.HIDDEN, "module 2"),
+        (safety.NOT_FINITE, "module 2"),
+        (safety.OUT_OF_VOLUME, "module 2"),
+        (safety.PORT_ERROR, "module 2 0x1031"),
+        (safety.INACCURATE, "module 2 1.01 mm, at most 1 mm"),
+    ],
+)
+def test_detail_names_the_tool(word, detail):
+    assert settled().judge(BAD[word](), 100.4).detail == detail
+
+
+@pytest.mark.parametrize(
+    ("bits", "word"),
+    [
+        (0x31, "good"),
+        (0x3F, "good"),  # buttons of the tool
+        (0xB1, safety.PORT_ERROR),
+        (0x131, safety.PORT_ERROR),
+        (0x231, safety.PORT_ERROR),
+        (0x8031, safety.PORT_ERROR),
+        (0x11, safety.PORT_ERROR),  # not enabled
+        (0x01, safety.PORT_ERROR),
+    ],
+)
+def test_port_status_is_checked(bits, word):
+    judged = FrameValidator(ROBOT).judge(frame(1, 100.0, port_status=(0x31, 0x31, 0x31, bits)), 100.01)
+    assert judged.word == word
+
+
+def test_limits_of_status_and_rms_are_those_of_the_robot_file():
+    robot = with_limits(refused_port_status=0x40, largest_rms_mm=0.05)
+    judge = FrameValidator(robot)
+    quality = np.full(4, 0.04)
+    assert judge.judge(frame(1, 100.0, quality=quality, port_status=(0xB1,) * 4), 100.01).good
+    assert judge.judge(frame(2, 100.1, port_status=(0x31,) * 4), 100.11).word == safety.INACCURATE
+
+
+def test_frame_without_quality_and_status_is_valid():
+    assert FrameValidator(ROBOT).judge(frame(1, 100.0, quality=np.full(4, np.nan)), 100.01).good
+
+
+def with_limits(**limits):
+    table = ROBOT.to_dict()
+    table["limits"].update(limits)
+    return robots.from_dict(table)
+
+
+def test_jump_that_stays_is_accepted_after_three_confirming_frames():
+    judge = settled()
+    words = []
+    for step in range(1, 6):
+        now_s = 100.0 + step * PERIOD_S
+        words.append(judge.judge(frame(6000 + 24 * step, now_s, (0.0, 0.0, 90.0)), now_s + 0.02).word)
+    assert words == [safety.JUMP] * 3 + ["good"] * 2
+
+
+def test_jump_that_stays_ends_a_run_of_the_shipped_limits():
+    judge, faults = settled(), FaultCounter(ROBOT)
+    checks = []
+    for step in range(1, 4):
+        now_s = 100.0 + step * PERIOD_S
+        checks.append(judge.judge(frame(6000 + 24 * step, now_s, (0.0, 0.0, 90.0)), now_s + 0.02))
+    faults.frame(checks[0])
+    faults.frame(checks[1])
+    with pytest.raises(Tripped, match="the last one jump"):
+        faults.frame(checks[2])
+
+
+@pytest.mark.parametrize("between", [(0.0, 0.0, -90.0), None])
+def test_confirming_frames_are_in_a_row_and_within_the_gate_of_each_other(between):
+    """Another jump, or a hidden tool, starts the confirmation again."""
+    judge = settled()
+    for step in range(1, 12):
+        now_s = 100.0 + step * PERIOD_S
+        disturbed = step % 3 == 0
+        valid = np.array([True, True, True, not (disturbed and between is None)])
+        angles = between if disturbed and between else (0.0, 0.0, 90.0)
+        assert not judge.judge(frame(6000 + 24 * step, now_s, angles, valid=valid), now_s + 0.02).good
+
+
+def test_a_gap_allows_no_larger_jump():
+    """The command is held without a valid frame, so that the robot does not move any further."""
+    judge = settled()
+    now_s = 100.0 + 3 * PERIOD_S
+    assert judge.judge(frame(6072, now_s, (0.0, 0.0, 90.0)), now_s + 0.02).word == safety.JUMP
+
+
+def test_no_limits_in_the_robot_file_give_a_gate():
+    table = ROBOT.to_dict()
+    del table["limits"]
+    judge = FrameValidator(robots.from_dict(table))
+    assert judge.judge(frame(6000, 100.0), 100.02).good
+    assert judge.judge(frame(6024, 100.4, (0.0, 0.0, 90.0)), 100.42).word == safety.JUMP
 
 
 def test_a_robot_as_fast_as_its_limits_allow_is_no_jump():
