@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from modsoft.export import bilstm_graph
 from modsoft.export.nodes import Weights
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import labels
 from modsoft.runtime.control.model import FixedSizeUnit, Unit, unit_of
 from modsoft.runtime.control.model_file import FEATURES, FROM_NEIGHBOURS, IR_VERSION, OPSET, Network
@@ -30,7 +31,6 @@ DRAWS = 4  # feature sets for each of them, and as many in all where it takes on
 WITHIN = 0.1  # what the slots of a drawn window differ by, at most twice
 SEED = 20240229
 
-Array = NDArray[np.float64]
 Draws = dict[int, list[Array]]
 
 

@@ -7,9 +7,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS, State, Status
 from modsoft.runtime.clock import SLICE_S, Tick, Ticker
 from modsoft.runtime.control.actuation import channel_pressures_bar
@@ -23,8 +21,6 @@ from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Stop
 from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 from modsoft.runtime.warmup import WarmUp
-
-Array = NDArray[np.float64]
 
 
 class Valves(Protocol):

@@ -8,14 +8,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import REST_LIMIT_DEG, angle_between_deg, from_poses
 from modsoft.runtime.errors import LostInRun, ModelError, ModsoftError, Tripped
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.tracking.frame import TrackerFrame
-
-Array = NDArray[np.float64]
 
 MISSED_IN_A_ROW = 2  # skipped ticks that are waited out; the board's own timer vents after 1 s
 RAW_LIMIT = 3.0  # the actuation runs from -1 to 1: a network that answers this far out extrapolates

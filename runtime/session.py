@@ -17,11 +17,10 @@ from pathlib import Path
 
 import click
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from modsoft.runtime import log as logs
 from modsoft.runtime import robot as robots
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.dry_run import Rehearsal
 from modsoft.runtime.board.ports import find_port, ports_here
@@ -52,8 +51,6 @@ from modsoft.runtime.tracking.frame import LatestFrame
 from modsoft.runtime.tracking.reader import Reader
 from modsoft.runtime.tracking.sources import open_source, port_of
 from modsoft.runtime.warmup import WarmUp
-
-Array = NDArray[np.float64]
 
 FIRST_FRAME_WAIT_S = 5.0
 

@@ -6,14 +6,12 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.clock import Tick
 from modsoft.runtime.control.features import bending_error_deg
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameCheck
-
-Array = NDArray[np.float64]
 
 
 class TickStatistics:

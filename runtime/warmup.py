@@ -11,9 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS
 from modsoft.runtime.clock import SPIN_S
 from modsoft.runtime.control.actuation import channel_pressures_bar, limited
@@ -21,8 +19,6 @@ from modsoft.runtime.control.features import Window, state_of
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameValidator, check_actuation
 from modsoft.runtime.tracking.frame import TrackerFrame
-
-Array = NDArray[np.float64]
 
 LEAD = 4.0  # durations of the fastest step: the first run, with cold caches, takes one or two
 MARGIN = 2.0  # durations of the fastest run: what must be left for another one

@@ -6,17 +6,15 @@ from pathlib import Path
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import ModelError, ModsoftError
 from modsoft.runtime.files import NOT_AN_ARRAY, check_not_input, check_writable, written
 from modsoft.runtime.robot import Robot
 from modsoft.training.simulation.fleet import Arms
 from modsoft.training.simulation.rollout import rollout
-
-Array = NDArray[np.float64]
 
 
 def read_actions(path: str, robot: Robot) -> Array:

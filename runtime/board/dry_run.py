@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS, Status
-
-Array = NDArray[np.float64]
 
 
 class Rehearsal:

@@ -7,15 +7,13 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.actuation import limited
 from modsoft.runtime.control.correction import Correction, NoCorrection
 from modsoft.runtime.control.features import Window, state_of
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import check_actuation
-
-Array = NDArray[np.float64]
 
 
 class Policy(Protocol):

@@ -11,11 +11,9 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.errors import UsageError
-
-Array = NDArray[np.float64]
 
 # How much of an error that stays the same is taken off in each period. Chosen on random smooth references of four and
 # six modules, never on the tasks that are reported: more takes off more, but from 0.5 on some robots of six modules

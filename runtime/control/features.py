@@ -7,15 +7,13 @@ the base), stored [v_x, v_y, v_z]. The network's state is the part of it that th
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.robot import KINDS
 
 COMPONENTS = ("v_x", "v_y", "v_z")
 REST_LIMIT_DEG = 60.0  # a module that is bent further does not hang at rest
 _STATE_INDEX = {name: [COMPONENTS.index(component) for component in kind.state] for name, kind in KINDS.items()}
-
-Array = NDArray[np.float64]
 
 
 def from_directors(directors: Array, base: Array | None = None) -> Array:

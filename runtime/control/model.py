@@ -13,13 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control import features, model_file
 from modsoft.runtime.control.model_file import ACTUATION, FEATURES, FROM_NEIGHBOURS, TO_NEIGHBOURS, Description
 from modsoft.runtime.control.ort import onnxruntime, onnxruntime_errors
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.robot import KINDS, Robot
-
-Array = NDArray[np.float64]
 
 LARGEST = float(np.finfo(np.float32).max)  # a larger feature is infinite in the network
 

@@ -15,9 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from modsoft.runtime.arrays import Array
 
 PAPERS = (4, 6)
 # Smallest v_z of each module, base first (A); v_z and amplitude (B); both (C).

@@ -9,16 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control import task_tables
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.control.task_tables import Bend
 from modsoft.runtime.errors import UsageError
 from modsoft.runtime.files import NOT_AN_ARRAY
 from modsoft.runtime.robot import Robot
-
-Array = NDArray[np.float64]
 
 SIMULATED_STEPS = 250
 REAL_STEPS = 200

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from modsoft.runtime.arrays import Array
 
 
 @dataclass(frozen=True)

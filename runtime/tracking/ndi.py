@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.ports import ports_here
 from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.tracking.frame import TrackerFrame
@@ -83,7 +83,7 @@ class NDI:
             pass  # a device that is gone cannot be told to stop
 
 
-def matrices(quaternions: NDArray[np.float64], translations: NDArray[np.float64]) -> NDArray[np.float64]:
+def matrices(quaternions: Array, translations: Array) -> Array:
     """Poses (n, 4, 4) from unit quaternions (n, 4), w first, and translations (n, 3), mm; NaN stays NaN."""
     rows = zip(np.asarray(quaternions).tolist(), np.asarray(translations).tolist(), strict=True)
     return np.array([_matrix(*quaternion, *translation) for quaternion, translation in rows])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from modsoft.hil.record import Array, Record
+from modsoft.hil.record import Record
 from modsoft.hil.valves import (
     ACKNOWLEDGED_P99_MS,
     full_counts_per_bar,
@@ -21,6 +21,7 @@ from modsoft.hil.valves import (
     valve_excursion,
     vent_limit_ms,
 )
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import angle_between_deg, bending_error_deg
 from modsoft.runtime.statistics import spread
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from modsoft.runtime.arrays import Array
+
 Event = dict[str, Any]
 
 FULL_COUNTS = 4096  # of the firmware's timers, where no output ever opened

@@ -24,14 +24,12 @@ from typing import Any, Protocol
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import RobotFileError
 from modsoft.runtime.robot import Robot
-
-Array = NDArray[np.float64]
 
 SLICE_S = 0.02
 # Where the tracker stands: the base's tool in its frame, 1.4 m in front and turned, so that a mistake in frames shows.

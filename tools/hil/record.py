@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from modsoft.hil.board.emulator import FIRMWARE, FIRMWARE_ELF
 from modsoft.hil.outputs import ValveOutputs, emulated_us, read_outputs
 from modsoft.runtime import log
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS, to_bar
 from modsoft.runtime.robot import Robot
 
-Array = NDArray[np.float64]
 Line = dict[str, Any]
 
 LATE_BOUND_MS = 20.0  # board.c: emulated time never falls further behind, it gives way and says `late`

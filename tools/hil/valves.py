@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from modsoft.hil.record import Array, Record
+from modsoft.hil.record import Record
+from modsoft.runtime.arrays import Array
 
 ACKNOWLEDGED_P99_MS = 30.0  # a set-point that was never acknowledged counts as so long on its way
 SETTLING_S = 0.03  # after acknowledgement and slew: some loops of the firmware; the board's lateness comes on top

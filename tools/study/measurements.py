@@ -16,8 +16,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import angle_between_deg
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import read_text, written
@@ -36,7 +36,6 @@ TIP_DISTANCE, TIP_TILT = "distance of the tip from the axis, % of the robot's le
 COVERED = "space covered by the module's end, cm³"
 
 Record = dict[str, Any]
-Array = NDArray[np.float64]
 
 
 def measure(plan: Plan, folder: Folder) -> None:

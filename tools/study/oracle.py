@@ -6,9 +6,7 @@ from functools import partial
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from modsoft.runtime.arrays import Array
 from modsoft.study import rollouts
 from modsoft.study.paths import Folder
 from modsoft.study.plan import Plan
@@ -17,8 +15,6 @@ from modsoft.training.simulation.fleet import simulated
 from modsoft.training.simulation.rollout import Rollout, rollout
 
 STEP_S = 0.35  # of one core, for a control step of four modules, about
-
-Array = NDArray[np.float64]
 
 
 def finding(plan: Plan, folder: Folder, jobs: int) -> Stage:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.training.simulation.parameters import CABLE
 from modsoft.training.simulation.rollout import Measure, exactly
 
@@ -20,8 +20,6 @@ WORDS = {
     "stiffness": "stiffness of each module off by 10 %",
     "payload": "a module's weight at the tip",
 }
-
-Array = NDArray[np.float64]
 
 
 def measure(disturbance: str, modules: int, seed: int) -> Measure:

@@ -13,9 +13,9 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control import actuation, controller, features, model, tasks
 from modsoft.runtime.control import correction as corrections
 from modsoft.runtime.control.model import Model
@@ -46,8 +46,6 @@ SHAPES: tuple[ModuleType, ...] = (
     perturbations,
 )
 STEP_S = 4e-3  # of one core, for a control step of one robot of four modules, about
-
-Array = NDArray[np.float64]
 
 
 class Kept(NamedTuple):

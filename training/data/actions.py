@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.actuation import limited
 from modsoft.runtime.robot import Robot
 
@@ -15,8 +16,6 @@ STRATEGIES = ("staged", "random", "smooth", "varied")
 JITTER = (0.003, 0.3)  # of smooth actions, smallest and largest
 KNOTS = (4.0, 60.0)  # steps from one random action to the next on the way of a smooth sequence, quickest and slowest
 OVER = 1.3  # knots are drawn from a range this much larger and cut to it, so that its ends are visited
-
-Array = NDArray[np.float64]
 
 
 def stage_borders(strategy: str, modules: int, steps: int) -> NDArray[np.int64]:

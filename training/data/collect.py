@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_writable, target_of
 from modsoft.runtime.robot import Robot
@@ -38,8 +38,6 @@ STIFFNESS_OFF = 0.15  # of a module's stiffness, at most
 PAYLOAD_MODULES = 4.0  # at the tip, in modules' weight, at most
 VARIED = 1  # what tells these random numbers from an episode's own
 MOST_ATTEMPTS = 10  # a robot that is not finite so often in a row is broken, not unlucky
-
-Array = NDArray[np.float64]
 
 
 def perturbation_of(recipe: dict[str, Any], robot: Robot, index: int) -> Perturbation | None:

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.errors import ModelError
 from modsoft.training import plotting
 from modsoft.training.data import dataset
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CUBE, SQUARE = 1 / 4, 1 / 25  # edge over the module's length: random data leave few gaps at that size
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import episode_features, state_of
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_is_file, written
@@ -34,8 +35,6 @@ from modsoft.training.data.hdf5 import own_array
 SCHEMA = 1
 # Shares of training, validation and test, as in the paper (70/10/20); these are where the second and third begin.
 VALIDATION_FROM, TEST_FROM = 0.7, 0.8
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

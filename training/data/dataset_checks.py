@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import REST_LIMIT_DEG
 from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.runtime.files import decoded
@@ -27,8 +28,6 @@ ATTRIBUTES = {
 }
 LENGTH_TOLERANCE = 1e-3  # of a unit vector: room for half precision and for numbers with four decimals
 RANGE_TOLERANCE = 1e-6  # of an action beyond [-1, 1]: room for the rounding of single precision
-
-Array = NDArray[np.float64]
 
 
 class Recipe(msgspec.Struct):

@@ -10,15 +10,13 @@ from collections.abc import Sequence
 
 import elastica
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.actuation import activations
 from modsoft.runtime.control.features import from_directors
 from modsoft.runtime.errors import ModsoftError
 from modsoft.training.simulation.loads import add_loads, follow
 from modsoft.training.simulation.parameters import PASCAL_PER_BAR, PLANTS, PlantParameters
-
-Array = NDArray[np.float64]
 
 
 class _Simulator(elastica.BaseSystemCollection, elastica.Constraints, elastica.Forcing):

@@ -17,14 +17,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.actuation import activations
 from modsoft.runtime.control.features import from_directors
 from modsoft.runtime.errors import ModsoftError
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.fleet_kernel import Damping
 from modsoft.training.simulation.parameters import PLANTS
-
-Array = NDArray[np.float64]
 
 # What stands in memory for one element, in vectors: `struct element` and `struct drive` of fleet_kernel.h.
 _ELEMENT = 20

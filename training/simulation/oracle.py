@@ -12,18 +12,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import lsq_linear
 from scipy.sparse.linalg import spsolve
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.errors import ModsoftError
 from modsoft.runtime.robot import KINDS
 from modsoft.training.simulation.fleet import Fleet, Snapshot
 from modsoft.training.simulation.rollout import configuration_errors_percent, rollout
-
-Array = NDArray[np.float64]
 
 PROBE = 1e-4  # of actuation, for finite differences
 CLOSE = 1e-5  # of the unit vector: nearer than this, no trial is worth it

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from msgspec.structs import fields
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.robot import Valve
-
-Array = NDArray[np.float64]
 
 PASCAL_PER_BAR = 1e5
 # Chamber pressures at activation 0 and 1: what a robot file means that does not say otherwise.

@@ -6,11 +6,9 @@ Made of what the tasks are made of (supplement S1 to S4), in random order and at
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.tasks import SIMULATED_STEPS
-
-Array = NDArray[np.float64]
 
 FARTHEST_DEG = 53.2  # v_z 0.6: the farthest that a task asks of a module
 WHOLE_DEG = 150.0  # the farthest that the paper's tasks ask of all modules together is 146

@@ -9,13 +9,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.controller import Controller
 from modsoft.runtime.control.correction import Correction, NoCorrection
 from modsoft.runtime.control.features import bending_error_deg
 from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.robot import Robot
 
-Array = NDArray[np.float64]
 Actuate = Callable[[Array], Array]
 Measure = Callable[[int, Array], Array | None]
 

@@ -6,16 +6,14 @@ import functools
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.errors import RobotFileError, UsageError
 from modsoft.runtime.robot import Robot
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.fleet import Arms, Fleet
 from modsoft.training.simulation.parameters import PASCAL_PER_BAR, PLANTS
 from modsoft.training.simulation.rollout import rollout
-
-Array = NDArray[np.float64]
 
 
 class Perturbation(NamedTuple):
