@@ -1,13 +1,12 @@
 """`make demo`: from nothing to a controlled robot on the emulated board, in at most ten minutes on two cores.
 
 collect -> train -> export -> run. Each stage is the console script that a user types; its command is shown. A stage is
-skipped when what it is made from (its command, the files it reads, the code that shapes its result) has not changed
-since; an interrupted collection or training goes on where it was. The run itself is always made anew.
+skipped while its command, the files that it reads and the code that shapes its result are unchanged; an interrupted
+collection or training is resumed. The run on the board is always repeated.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shlex
@@ -21,6 +20,7 @@ from typing import Any
 
 from modsoft.hil import report_folder
 from modsoft.runtime.errors import ModsoftError, TargetNotReached
+from modsoft.training import made_from
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = Path("demo")
@@ -30,20 +30,17 @@ DATA, CHECKPOINT, MODEL, REPORT = (FOLDER / name for name in ("dataset.h5", "mod
 
 @dataclass(frozen=True)
 class Stage:
-    """A command, what it makes, and the files that its result depends on (paths or patterns from the root)."""
+    """A command, the file that it makes, the files that it reads, and the module that makes the result."""
 
     title: str
     command: list[str]
     makes: Path
-    depends_on: list[str]
+    reads: list[Path]
+    module: str
 
     def digest(self) -> str:
-        """Changes whenever the result could."""
-        digest = hashlib.sha256(json.dumps(self.command).encode())
-        for pattern in self.depends_on:
-            for path in sorted(Path(".").glob(pattern)):
-                digest.update(f"\0{path}\0".encode() + path.read_bytes())
-        return digest.hexdigest()
+        """Changes with the command, the files that it reads, and the code that shapes the result."""
+        return made_from.digest(self.command, self.reads, [self.module])
 
     @property
     def results(self) -> list[Path]:
@@ -51,79 +48,52 @@ class Stage:
         return [self.makes, *(self.makes.with_name(self.makes.name + suffix) for suffix in (".parts", ".resume"))]
 
     @property
-    def stamp(self) -> Path:
+    def digest_file(self) -> Path:
         return self.makes.with_name(f".{self.makes.name}.made-from")
 
 
-# What the data, the network and the model file have in common: features, state, and what an action means.
-SHARED = ["runtime/robot.py", "runtime/control/*.py"]
 STAGES = [
     Stage(
         "collect data from the simulated three-module robot",
         ["modsoft-collect", "--robot", ROBOT, "--samples", "15000", "--strategy", "staged", "--out", str(DATA)],
         DATA,
-        [
-            f"runtime/robots/{ROBOT}.toml",
-            "training/simulation/*.[ch]",
-            "training/simulation/*.py",
-            "training/data/*.py",
-            *SHARED,
-        ],
+        [Path(f"runtime/robots/{ROBOT}.toml")],
+        "modsoft.training.data.collect",
     ),
     Stage(
         "train the biLSTM controller",
         # To a validation error that controls the robot well within the rig's limits; the time is only a bound.
-        [
-            "modsoft-train",
-            str(DATA),
-            "--out",
-            str(CHECKPOINT),
-            "--iterations",
-            "1000",
-            "--target-percent",
-            "0.7",
-            "--minutes",
-            "5",
-        ],
+        shlex.split(f"modsoft-train {DATA} --out {CHECKPOINT} --iterations 1000 --target-percent 0.7 --minutes 5"),
         CHECKPOINT,
-        [str(DATA), *SHARED, "training/data/*.py"]
-        + [f"training/{name}.py" for name in ("train", "optimizer", "networks", "checkpoint")],
+        [DATA],
+        "modsoft.training.train",
     ),
     Stage(
         "export it and compare it with torch",
         ["modsoft-export", str(CHECKPOINT), "--out", str(MODEL)],
         MODEL,
-        [str(CHECKPOINT), "export/*.py", *SHARED, "training/networks.py", "training/checkpoint.py"],
+        [CHECKPOINT],
+        "modsoft.export.write",
     ),
 ]
-RUN = [
-    "modsoft-hil",
-    "--robot",
-    ROBOT,
-    "--model",
-    str(MODEL),
-    "--task",
-    TASK,
-    "--report",
-    str(REPORT),
-]
+RUN = shlex.split(f"modsoft-hil --robot {ROBOT} --model {MODEL} --task {TASK} --report {REPORT}")
 
 
 def run(command: list[str]) -> int:
-    """Exit code of a console script beside this interpreter; its output goes to this terminal."""
+    """Runs a console script beside this interpreter, with its output on this terminal; returns its exit code."""
     print(f"    $ {shlex.join(command)}", flush=True)
     process = subprocess.Popen([str(Path(sys.executable).parent / command[0]), *command[1:]])
     try:
         return process.wait()
     except KeyboardInterrupt:
-        process.wait()  # it had the Ctrl-C too, and ends in order
+        process.wait()  # it received the Ctrl-C too, and ends in order
         raise
 
 
 def make(stage: Stage, number: str) -> int:
-    """Runs a stage unless its result is there and up to date; its exit code."""
+    """Runs a stage unless its result is up to date; returns its exit code."""
     digest = stage.digest()
-    before = stage.stamp.read_text() if stage.stamp.is_file() else ""
+    before = stage.digest_file.read_text() if stage.digest_file.is_file() else ""
     if stage.makes.is_file() and before == digest:
         print(f"{number} {stage.title}: {stage.makes} is up to date", flush=True)
         return 0
@@ -132,20 +102,20 @@ def make(stage: Stage, number: str) -> int:
     if existing and not before:
         print(f"demo: {existing[0]}: not made by the demo; move it elsewhere", file=sys.stderr)
         return 2
-    if before != digest:  # what is there, finished or half done, was made from something else
+    if before != digest:  # the existing files, finished or not, were made from something else
         for old in existing:
             shutil.rmtree(old) if old.is_dir() else old.unlink()
-    stage.stamp.write_text(digest)  # first, so that an interrupted stage goes on
+    stage.digest_file.write_text(digest)  # first, so that an interrupted stage is resumed
     started_s = time.monotonic()
     code = run(stage.command)
     if code == TargetNotReached.exit_code:  # so the next demo starts this stage from the beginning
-        stage.stamp.write_text("missed its target\n")
+        stage.digest_file.write_text("missed its target\n")
     print(f"    {time.monotonic() - started_s:.0f} s", flush=True)
     return code
 
 
 def summary(report: dict[str, Any]) -> list[str]:
-    """The short report of a run."""
+    """Lines that summarise the report of a run."""
     figures = report["figures"]
     late, acknowledged = figures["lateness_ms"], figures["acknowledged_ms"]
     lines = [f"{ROBOT}, task {TASK}, {figures['ticks']} ticks; board: {report['about']['board']}"]
@@ -155,8 +125,8 @@ def summary(report: dict[str, Any]) -> list[str]:
             lines.append(f"  tracking error of module {module}  {mean:.2f}° ± {std:.2f}°")
     for name, spread in (("tick lateness", late), ("acknowledgement", acknowledged)):
         if spread:
-            found = f"median {spread['p50']:.1f}, 99 % {spread['p99']:.1f}, largest {spread['max']:.1f} ms"
-            lines.append(f"  {name:<27} {found}")
+            values = f"median {spread['p50']:.1f}, 99 % {spread['p99']:.1f}, largest {spread['max']:.1f} ms"
+            lines.append(f"  {name:<27} {values}")
     lines.append(f"  missed ticks, held ticks    {figures['missed_ticks']}, {figures['held_ticks']}")
     verdict = ": ".join(filter(None, (report["verdict"], report["reason"])))
     lines.append(f"  verdict                     {verdict}")
@@ -173,16 +143,16 @@ def main() -> int:
             print(f"demo: stopped, {stage.command[0]} ended with exit code {code}", file=sys.stderr)
             return code
     print(f"[{count}/{count}] run it on the emulated board, the fake tracker and the simulated robot", flush=True)
-    found = REPORT / "report.json"
+    report = REPORT / "report.json"
     try:
-        report_folder.drop_report(REPORT)  # whatever is shown below is of this run
+        report_folder.drop_report(REPORT)  # so that the figures below are of this run
     except ModsoftError as error:
         print(f"demo: {error}", file=sys.stderr)
         return error.exit_code
     code = run(RUN)
-    if found.is_file():
+    if report.is_file():
         print()
-        print("\n".join(summary(json.loads(found.read_text()))))
+        print("\n".join(summary(json.loads(report.read_text()))))
         print(f"  picture                     {REPORT / 'angles.png'}")
         print(f"  report                      {REPORT / 'report.md'}")
     print(f"  whole demo                  {time.monotonic() - started_s:.0f} s")
@@ -193,5 +163,5 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except KeyboardInterrupt:
-        print("demo: interrupted; the same command goes on from here", file=sys.stderr)
+        print("demo: interrupted; make demo resumes it", file=sys.stderr)
         sys.exit(130)

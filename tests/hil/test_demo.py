@@ -1,23 +1,27 @@
-"""`make demo`: what is made again and what is not, and the short report."""
+"""`make demo`: which stages are repeated, which are skipped, and the summary."""
 
-import ast
 import importlib.util
+import itertools
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+
+from modsoft.training import made_from
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
 def demo(tmp_path, monkeypatch):
-    """tools/demo.py, in an empty folder, with commands that are recorded and end as told."""
+    """tools/demo.py, in an empty folder, with commands that are recorded and end with `exit_code`."""
     spec = importlib.util.spec_from_file_location("demo", ROOT / "tools" / "demo.py")
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(__import__("sys").modules, "demo", module)  # dataclasses look their module up
     spec.loader.exec_module(module)
     monkeypatch.chdir(tmp_path)
     module.FOLDER.mkdir()
+    Path("input.txt").write_text("1")
     module.ran = []
 
     def run(command):
@@ -31,18 +35,18 @@ def demo(tmp_path, monkeypatch):
 
 
 def stage(demo, *options):
-    return demo.Stage("make it", ["tool", *options, "demo/result"], demo.FOLDER / "result", ["input.*"])
+    command = ["tool", *options, "demo/result"]
+    return demo.Stage("make it", command, demo.FOLDER / "result", [Path("input.txt")], "modsoft.training.made_from")
 
 
-def test_a_stage_is_made_once(demo):
+def test_stage_is_made_once(demo):
     assert demo.make(stage(demo), "[1/1]") == 0
     assert demo.make(stage(demo), "[1/1]") == 0
     assert demo.ran == ["tool"]
 
 
 @pytest.mark.parametrize("change", ["input", "command", "result lost"])
-def test_a_stage_is_made_again_when_something_changed(demo, change):
-    Path("input.txt").write_text("1")
+def test_stage_is_repeated_when_something_changed(demo, change):
     demo.make(stage(demo), "[1/1]")
     options = []
     match change:
@@ -56,7 +60,7 @@ def test_a_stage_is_made_again_when_something_changed(demo, change):
     assert demo.ran == ["tool", "tool"]
 
 
-def test_an_interrupted_stage_goes_on_with_what_it_left(demo):
+def test_interrupted_stage_is_resumed(demo):
     demo.make(stage(demo), "[1/1]")
     (demo.FOLDER / "result").unlink()
     parts = demo.FOLDER / "result.parts"
@@ -65,7 +69,7 @@ def test_an_interrupted_stage_goes_on_with_what_it_left(demo):
     assert parts.is_dir()
 
 
-def test_leftovers_of_another_order_are_cleared_away(demo):
+def test_unfinished_files_of_another_command_are_deleted(demo):
     demo.make(stage(demo), "[1/1]")
     parts = demo.FOLDER / "result.parts"
     parts.mkdir()
@@ -76,7 +80,7 @@ def test_leftovers_of_another_order_are_cleared_away(demo):
 
 
 @pytest.mark.parametrize("name", ["result", "result.parts"])
-def test_files_that_the_demo_did_not_make_stay(demo, name, capsys):
+def test_files_of_the_user_are_kept(demo, name, capsys):
     (demo.FOLDER / name).write_text("mine")
     assert demo.make(stage(demo), "[1/1]") == 2
     assert capsys.readouterr().err == f"demo: demo/{name}: not made by the demo; move it elsewhere\n"
@@ -84,7 +88,7 @@ def test_files_that_the_demo_did_not_make_stay(demo, name, capsys):
     assert demo.ran == []
 
 
-def test_another_order_leaves_files_with_similar_names(demo):
+def test_files_with_similar_names_are_kept(demo):
     demo.make(stage(demo), "[1/1]")
     (demo.FOLDER / "result.old").write_text("mine")
     demo.make(stage(demo, "--more"), "[1/1]")
@@ -105,7 +109,7 @@ def test_only_a_report_of_the_rig_is_replaced(demo, monkeypatch, capsys):
     assert not (demo.REPORT / "report.json").exists()
 
 
-def test_a_failed_stage_is_made_again(demo):
+def test_failed_stage_is_repeated(demo):
     demo.exit_code = 65
     assert demo.make(stage(demo), "[1/1]") == 65
     demo.exit_code = 0
@@ -114,7 +118,7 @@ def test_a_failed_stage_is_made_again(demo):
     assert demo.ran == ["tool", "tool"]
 
 
-def test_a_network_that_has_not_learned_enough_is_never_exported_and_trained_from_the_start_again(demo):
+def test_training_that_missed_its_target_stops_the_demo_and_starts_again(demo):
     demo.exit_code = 77
     assert demo.make(stage(demo), "[1/1]") == 77
     demo.exit_code = 0
@@ -124,50 +128,22 @@ def test_a_network_that_has_not_learned_enough_is_never_exported_and_trained_fro
     assert not (demo.FOLDER / "result.resume").exists()
 
 
-def test_the_stages_hang_together(demo):
-    """What a stage makes is what the next one depends on, and the files of the project that they name exist."""
-    for before, after in zip(demo.STAGES, demo.STAGES[1:], strict=False):
-        assert str(before.makes) in after.depends_on
+def test_each_stage_reads_the_result_of_the_one_before(demo):
+    for before, after in itertools.pairwise(demo.STAGES):
+        assert before.makes in after.reads
         assert str(before.makes) in after.command
     assert str(demo.STAGES[-1].makes) in demo.RUN
-    for pattern in [pattern for each in demo.STAGES for pattern in each.depends_on]:
-        assert pattern.startswith("demo/") or list(ROOT.glob(pattern)), pattern
+    for path in [path for each in demo.STAGES for path in each.reads]:
+        assert path.parent == demo.FOLDER or (ROOT / path).is_file(), path
 
 
-# What a stage runs, and what of that shapes no result: messages, the command line, who works where.
-ENTRIES = {
-    "modsoft-collect": "training/data/collect.py",
-    "modsoft-train": "training/train.py",
-    "modsoft-export": "export/write.py",
-}
-SHAPELESS = {
-    *(f"runtime/{name}.py" for name in ("errors", "entry_point", "validation_messages", "files", "locks")),
-    "training/data/workers.py",
-    "training/data/coverage.py",
-}
-
-
-def imported(path, found):
-    """Files of the project that `path` imports, wherever in it, and those that they import."""
-    found.add(str(path))
-    for node in ast.walk(ast.parse((ROOT / path).read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("modsoft."):
-            folder = Path(*node.module.split(".")[1:])
-            names = [folder.with_suffix(".py"), *(folder / f"{alias.name}.py" for alias in node.names)]
-            for name in names:
-                if (ROOT / name).is_file() and str(name) not in found | SHAPELESS:
-                    imported(name, found)
-    return found
-
-
-def test_a_stage_depends_on_all_code_that_it_runs(demo):
+def test_each_stage_names_a_module_of_its_command(demo):
+    scripts = {script.name: script.module for script in entry_points(group="console_scripts")}
     for each in demo.STAGES:
-        named = {str(path.relative_to(ROOT)) for pattern in each.depends_on for path in ROOT.glob(pattern)}
-        needed = imported(Path(ENTRIES[each.command[0]]), set())
-        assert needed - named == set(), each.title
+        assert each.module in made_from.sources(scripts[each.command[0]])
 
 
-def test_the_short_report_says_what_is_asked(demo):
+def test_summary_has_the_figures_of_the_run(demo):
     spread = {"p50": 0.2, "p99": 1.5, "max": 2.0}
     figures = {
         "ticks": 200,
