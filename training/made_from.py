@@ -41,7 +41,8 @@ def sources(*modules: str) -> dict[str, Path]:
         path = None if name in found or name in WITHOUT_EFFECT else _file(name)
         if path is not None:
             found[name] = path
-            found |= {f"{name}:{source.name}": source for source in path.parent.glob("*.[ch]")}
+            package = name.rpartition(".")[0]
+            found |= {f"{package}/{source.name}": source for source in path.parent.glob("*.[ch]")}
             left += _imports(ast.parse(path.read_bytes()))
     missing = [name for name in modules if name not in found]
     if missing:

@@ -14,7 +14,7 @@ from modsoft.runtime.errors import ModelError, OutputError
 from modsoft.study import figures, measurements, oracle, plan, rollouts, stages
 from modsoft.study.cells import pick
 from modsoft.study.paths import Folder
-from modsoft.training import checkpoint
+from modsoft.training import checkpoint, made_from
 
 pytestmark = pytest.mark.slow
 
@@ -89,6 +89,11 @@ def test_runs_of_a_model_that_changed_and_damaged_ones_are_flown_again(study):
     folder.run(other).write_bytes(folder.run(other).read_bytes()[:1000])
     again = {run for batch in rollouts.rolling_out(PLAN, folder, 1).items for run in batch}
     assert again == {run for run in PLAN.runs if run.model == MAIN} | {other}
+
+
+def test_code_of_a_run_includes_tables_and_kernel():
+    names = made_from.sources(*rollouts.MODULES)
+    assert {"modsoft.runtime.control.task_tables", "modsoft.training.simulation/fleet.c"} <= set(names)
 
 
 def test_an_error_of_control_is_the_distance_at_the_start_of_each_step(made_study):

@@ -31,7 +31,7 @@ def test_sources_are_those_imported_directly_or_through_others():
 
 
 def test_compiled_kernel_belongs_to_the_simulation():
-    assert "modsoft.training.simulation.fleet_kernel:fleet.c" in made_from.sources("modsoft.training.simulation.fleet")
+    assert "modsoft.training.simulation/fleet.c" in made_from.sources("modsoft.training.simulation.fleet")
 
 
 def test_import_inside_a_function_counts(package):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 from functools import partial
-from importlib.metadata import version
 from typing import Any
 
 from modsoft.runtime.arrays import Array
@@ -11,6 +11,7 @@ from modsoft.study import rollouts
 from modsoft.study.paths import Folder
 from modsoft.study.plan import Plan
 from modsoft.study.scheduler import Stage, Told
+from modsoft.training import made_from
 from modsoft.training.simulation.fleet import simulated
 from modsoft.training.simulation.rollout import Rollout, rollout
 
@@ -29,9 +30,15 @@ def find_s(plan: Plan, each: tuple[str, int]) -> float:
     return (plan.steps or 250) * STEP_S * (each[1] / 4) ** 2
 
 
+@functools.cache
+def code_sha256() -> str:
+    """Digest of the source code that shapes an oracle error."""
+    return made_from.digest({}, modules=["modsoft.training.simulation.oracle", "modsoft.runtime.control.tasks"])
+
+
 def identity(plan: Plan, task: str, modules: int) -> dict[str, Any]:
     steps = len(rollouts.desired_of(plan, task, modules))
-    return {"task": task, "modules": modules, "steps": steps, "seed": 0, "code_version": version("modsoft")}
+    return {"task": task, "modules": modules, "steps": steps, "seed": 0, "code_sha256": code_sha256()}
 
 
 def _find(plan: Plan, folder: Folder, each: tuple[str, int], told: Told) -> None:

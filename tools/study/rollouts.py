@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import itertools
 import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.control import actuation, controller, features, model, tasks
 from modsoft.runtime.control import correction as corrections
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import task
@@ -26,25 +23,19 @@ from modsoft.study import perturbations, stages
 from modsoft.study.paths import NOT_READABLE, Folder
 from modsoft.study.plan import Plan, Run
 from modsoft.study.scheduler import Stage, Told
-from modsoft.training.simulation import fleet, parameters
-from modsoft.training.simulation import rollout as rollout_module
+from modsoft.training import made_from
 from modsoft.training.simulation.fleet import simulated
 from modsoft.training.simulation.rollout import ControllerSetup, Rollout, rollout
 
 TOGETHER = 16  # robots of a batch: two blocks of the kernel's widest vectors
-# The code that shapes a run beside the model and the kernel.
-SHAPES: tuple[ModuleType, ...] = (
-    actuation,
-    controller,
-    features,
-    model,
-    corrections,
-    tasks,
-    rollout_module,
-    fleet,
-    parameters,
-    perturbations,
-)
+# What makes a run, beside the model; the modules that these import count too.
+MODULES = [
+    "modsoft.runtime.control.model",
+    "modsoft.runtime.control.tasks",
+    "modsoft.training.simulation.rollout",
+    "modsoft.training.simulation.fleet",
+    "modsoft.study.perturbations",
+]
 STEP_S = 4e-3  # of one core, for a control step of one robot of four modules, about
 
 
@@ -98,11 +89,8 @@ def identity(plan: Plan, run: Run, seal: str) -> dict[str, Any]:
 
 @functools.cache
 def code_sha256() -> str:
-    """Of the source of all that shapes a run. Runs are cheap, so they are made again rather than be doubtful."""
-    digest = hashlib.sha256()
-    for module in SHAPES:
-        digest.update(Path(str(module.__file__)).read_bytes())
-    return digest.hexdigest()
+    """Digest of the source code that shapes a run, the compiled kernel's included."""
+    return made_from.digest({}, modules=MODULES)
 
 
 def desired_of(plan: Plan, name: str, modules: int) -> Array:
