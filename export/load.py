@@ -91,7 +91,7 @@ def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
             "dropout": 0.0,
             "history": said.history,
         },
-        "features": feature_names(robot.robot.kind, said.history),
+        "features": feature_names(robot.kind, said.history),
         "weights": weights,
         "provenance": said.provenance,
     }
@@ -113,7 +113,7 @@ def _check(checkpoint: dict[str, Any], path: Path) -> None:
     except RobotFileError as error:  # of this file, not of a robot file that the user can mend
         raise ModelError(f"{error}; train it again with this version") from error
     network = network_of(checkpoint, str(path))
-    kind, history = robot.robot.kind, network.history
+    kind, history = robot.kind, network.history
     bound = None if network.name == "bilstm" else robot.modules
     if network.modules != bound:
         raise ModelError(f"{path}: {network.name} of {network.modules} modules, expected {bound}; train it again")

@@ -33,7 +33,7 @@ def _check_robot(name: str) -> None:
             steps = len(load_task(task, robot))
         except UsageError as error:
             raise RobotFileError(f"{name}: task under [loop]: {error}") from error
-    click.echo(f"{name}: {robot.name}, {robot.robot.kind}, {robot.modules} modules, {robot.loop.hz:g} Hz")
+    click.echo(f"{name}: {robot.name}, {robot.kind}, {robot.modules} modules, {robot.loop.hz:g} Hz")
     if task:
         click.echo(f"task {task}: {steps} steps, {steps * robot.loop.period_s:g} s")
     if robot.valve is not None:

@@ -140,16 +140,17 @@ class Robot(Section, frozen=True):
         return self.robot.modules
 
     @property
-    def kind(self) -> Kind:
-        return KINDS[self.robot.kind]
+    def kind(self) -> str:
+        """Key of `KINDS`: "cable" or "pneumatic"."""
+        return self.robot.kind
 
     @property
     def state_size(self) -> int:
-        return len(self.kind.state)
+        return len(KINDS[self.kind].state)
 
     @property
     def action_size(self) -> int:
-        return len(self.kind.action)
+        return len(KINDS[self.kind].action)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain Python values, for a checkpoint, ONNX metadata or a log."""
@@ -230,7 +231,7 @@ def _check(robot: Robot, where: str) -> None:
     count = robot.modules
     if robot.tracker.tools and len(robot.tracker.tools) != count + 1:
         refuse(f"tracker.tools has {len(robot.tracker.tools)} entries", f"{count + 1}: base, then modules 1 to {count}")
-    if robot.robot.kind == "cable":
+    if robot.kind == "cable":
         if robot.valve is not None or robot.chambers:
             refuse("a cable robot with [valve] or [[chambers]]", "neither: cable robots are simulated")
         return

@@ -221,9 +221,9 @@ def _robot(options: Options) -> tuple[Robot, str, Path]:
             "modsoft-runtime --print-robot pneumatic-3 > robot.toml"
         )
     robot = robots.load(options.robot)
-    if robot.robot.kind != "pneumatic":
+    if robot.kind != "pneumatic":
         raise RobotFileError(
-            f"robot {robot.name} is of kind {robot.robot.kind!r}, which is only simulated (modsoft-simulate); "
+            f"robot {robot.name} is of kind {robot.kind!r}, which is only simulated (modsoft-simulate); "
             "modsoft-runtime drives pneumatic robots"
         )
     if options.tracker:

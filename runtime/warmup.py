@@ -81,7 +81,7 @@ class WarmUp:
         configuration = self._judge.content(frame)[2]
         if configuration is None:
             return
-        raw = self._actuate(window.features(state_of(configuration, self._robot.robot.kind)))
+        raw = self._actuate(window.features(state_of(configuration, self._robot.kind)))
         check_actuation(raw)
         actuation = limited(raw, applied, self._robot.limits.largest_actuation_step)
         channel_pressures_bar(self._robot, actuation, CHANNELS)

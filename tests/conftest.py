@@ -72,7 +72,7 @@ def make_checkpoint():
         from modsoft.training import networks
 
         found = robots.load(robot)
-        names = feature_names(found.robot.kind, history)
+        names = feature_names(found.kind, history)
         sizes = {"name": name, "feature_size": len(names), "action_size": found.action_size, "layers": layers}
         sizes |= {"hidden": hidden, "dropout": 0.1, "history": history}
         if name != "bilstm":

@@ -40,10 +40,10 @@ def test_a_shipped_model_drives_its_robot(file, robot, task, most):
     far less than that of a model that does not drive."""
     robot = robots.load(robot)
     controller = Model.load(MODELS / f"{file}.onnx")
-    desired = tasks.task(task, robot.robot.kind, robot.modules)[:60]
+    desired = tasks.task(task, robot.kind, robot.modules)[:60]
     pilot = ControllerSetup(robot, controller.actuate, controller.history, desired)
-    (flight,) = rollout.rollout(Fleet(robot.robot.kind, robot.modules, 1), [pilot]).robots()
-    errors = rollout.angle_errors_deg if robot.robot.kind == "pneumatic" else rollout.configuration_errors_percent
+    (flight,) = rollout.rollout(Fleet(robot.kind, robot.modules, 1), [pilot]).robots()
+    errors = rollout.angle_errors_deg if robot.kind == "pneumatic" else rollout.configuration_errors_percent
     assert errors(flight.configuration, desired).mean(axis=0).max() < most
     still = np.broadcast_to(flight.configuration[:1], (61, robot.modules, 3))
     assert errors(still, desired).mean(axis=0).max() > 2 * most

@@ -227,7 +227,7 @@ def _train(
         "schema": checkpoints.SCHEMA,
         "robot": robot,
         "network": described,
-        "features": feature_names(data[0].robot.robot.kind, settings.history),
+        "features": feature_names(data[0].robot.kind, settings.history),
         "weights": state["best"],
         "provenance": {
             **identity,

@@ -96,7 +96,7 @@ def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
     from modsoft.training.data import dataset
 
     data = [dataset.read(path) for path in data_files]
-    settings = train.settings_for(data[0].robot.robot.kind, options)
+    settings = train.settings_for(data[0].robot.kind, options)
     began_s, first, smooth = time.monotonic(), None, 0.0
     shown = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
     with tqdm(total=100, desc="train", bar_format=shown, disable=is_there) as bar:

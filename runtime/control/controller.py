@@ -33,7 +33,7 @@ class Controller:
         """rest: configuration (N, 3) at the start, with actuation 0 in force. correction: a new one, or none."""
         self._robot, self._policy = robot, policy
         self._correction = NoCorrection() if correction is None else correction
-        self._state = state_of(rest, robot.robot.kind)
+        self._state = state_of(rest, robot.kind)
         self.window = Window(policy.history, self._state, robot.action_size)
         self.applied = np.zeros((robot.modules, robot.action_size))  # in force
         self.target: Array | None = None  # (N, 3) that the policy was asked for in this step, None where it was not
@@ -46,7 +46,7 @@ class Controller:
         is held. desired, next_desired: desired configurations (N, 3) at the start and at the end of the step. Raises
         `ModelError` for an answer that is not finite or far out of [-1, 1].
         """
-        kind = self._robot.robot.kind
+        kind = self._robot.kind
         if measured is not None:
             self._state = state_of(measured, kind)
         self.window.observe(self._state)

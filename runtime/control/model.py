@@ -213,7 +213,7 @@ class Model:
         the network is bound to one."""
         said = self.description
         pairs = {
-            "kind": (said.kind, robot.robot.kind),
+            "kind": (said.kind, robot.kind),
             "state size": (said.state_size, robot.state_size),
             "action size": (said.action_size, robot.action_size),
             "period_s": (said.period_s, robot.loop.period_s),

@@ -105,7 +105,7 @@ def _is_file_name(task: str) -> bool:
 def load_task(name_or_file: str, robot: Robot) -> Array:
     """A task by its name, or from a .npy file of unit vectors (steps, N, 3)."""
     if not _is_file_name(name_or_file):
-        return task(name_or_file, robot.robot.kind, robot.modules)
+        return task(name_or_file, robot.kind, robot.modules)
     if Path(name_or_file).is_dir():
         raise UsageError(f"task file {name_or_file} is a folder; give an existing .npy file or a task's name")
     if not Path(name_or_file).is_file():

@@ -71,7 +71,7 @@ def as_in_collection(found, run_folder):
     """Configurations at the ticks (K, N, 3) of the robot that training data comes from, given what the run applied."""
     from modsoft.training.simulation.elastica import Arm
 
-    arm = Arm(found.robot.robot.kind, found.robot.modules)
+    arm = Arm(found.robot.kind, found.robot.modules)
     arm.step(np.zeros((found.robot.modules, 1)))  # the period before the first tick
     there = []
     for tick in log.read(run_folder).ticks:

@@ -20,7 +20,7 @@ from modsoft.runtime.errors import RobotFileError
 )
 def test_shipped_robots(name, kind, modules, state, action):
     robot = robots.load(name)
-    assert (robot.name, robot.robot.kind, robot.modules) == (name, kind, modules)
+    assert (robot.name, robot.kind, robot.modules) == (name, kind, modules)
     assert (robot.state_size, robot.action_size) == (state, action)
 
 

@@ -39,7 +39,7 @@ def test_out_of_the_plane_a_module_is_turned_with_the_one_before():
 @pytest.mark.parametrize(("name", "farthest_m"), [("pneumatic-3", 0.010), ("cable-4", 0.030)])
 def test_the_arcs_follow_the_simulated_robot(name, farthest_m):
     robot = robots.load(name)
-    arm = Arm(robot.robot.kind, robot.modules)
+    arm = Arm(robot.kind, robot.modules)
     arm.step(np.full((robot.modules, robot.action_size), 0.4), 0.4)
     ends = coverage.module_ends(arm.configuration, arm.plant.module_length_m)
     assert np.abs(arm.positions[:, 0]).max() > 3e-3

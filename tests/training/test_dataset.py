@@ -77,7 +77,7 @@ def test_windows_are_what_the_loop_would_have_seen(kind):
     data = make(1, 240, kind)
     history = 5
     training, _, _ = d.split(data, history, "blocks", 0)
-    name = data.robot.robot.kind
+    name = data.robot.kind
     states = state_of(data.configuration[0], name)
     window = Window(history, states[0], data.robot.action_size)
     seen = {}

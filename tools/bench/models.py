@@ -27,7 +27,7 @@ CORRECTIONS = ("none", "integral")
 def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]:
     """A row for each task and correction."""
     robot, controller = robots.load(name), Model.load(MODELS / f"{model}.onnx")
-    kind = robot.robot.kind
+    kind = robot.kind
     flown = [(task, each) for task in tasks.available(kind, robot.modules) for each in CORRECTIONS]
     pilots = []
     for task, each in flown:

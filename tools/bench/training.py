@@ -122,7 +122,7 @@ def adam(race: Race, data: DataSet) -> None:
 def ours(race: Race, data: DataSet) -> None:
     """modsoft-train without its command line."""
     settings = train.Settings(
-        **train.BY_KIND[data.robot.robot.kind] | {"split": "shuffled", "batch": race.batch},
+        **train.BY_KIND[data.robot.kind] | {"split": "shuffled", "batch": race.batch},
         iterations=race.iterations,
         layers=race.layers,
         hidden=race.hidden,
@@ -152,7 +152,7 @@ def authors(race: Race, data: DataSet) -> None:
     """The training of the paper, until someone ends it."""
     torch.set_num_threads(1)
     torch.manual_seed(race.seed)
-    history = train.BY_KIND[data.robot.robot.kind]["history"]
+    history = train.BY_KIND[data.robot.kind]["history"]
     training, validation, _ = dataset.split(data, history, "shuffled", race.seed)
     network = BiLSTM(training.features.shape[-1], training.targets.shape[-1], race.layers, race.hidden, dropout=0.1)
     optimiser = torch.optim.Adam(network.parameters(), lr=0.001)
@@ -180,7 +180,7 @@ def step_times(rounds: int) -> list[dict[str, Any]]:
     rows = []
     for batch, name, wanted in STEPS:
         robot = robots.load(name)
-        history = train.BY_KIND[robot.robot.kind]["history"]
+        history = train.BY_KIND[robot.kind]["history"]
         sizes = {"feature_size": history * (robot.state_size + robot.action_size) + 1, "action_size": robot.action_size}
         network = networks.build({"name": "bilstm", "layers": 4, "hidden": 128, **sizes})
         both, features = optimizer.MuonAndAdam(network), torch.randn(batch, robot.modules, sizes["feature_size"])

@@ -80,8 +80,8 @@ def tool_poses(positions: Array, directors: Array) -> Array:
 def load_robot(robot_file: str | Path) -> Robot:
     """The robot file of a robot that the rig can run; `RobotFileError` for one without valves."""
     robot = robots.load(robot_file)
-    if robot.robot.kind != "pneumatic":
-        raise RobotFileError(f"{robot_file}: a {robot.robot.kind} robot has no valves; the rig runs pneumatic robots")
+    if robot.kind != "pneumatic":
+        raise RobotFileError(f"{robot_file}: a {robot.kind} robot has no valves; the rig runs pneumatic robots")
     return robot
 
 
@@ -177,7 +177,7 @@ def cli(robot_file: Path) -> None:
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
 
-    arm = Arm(robot.robot.kind, robot.modules)
+    arm = Arm(robot.kind, robot.modules)
     warm = ValvesAndArm(robot, arm)
     warm.advance(np.zeros(0), SLICE_S)  # compiles
     arm.reset()

@@ -48,7 +48,7 @@ def perturbation_of(recipe: dict[str, Any], robot: Robot, index: int) -> Perturb
     rng = np.random.default_rng(np.random.SeedSequence(recipe["seed"], spawn_key=(index // ALIKE, 0, VARIED)))
     stiffness = 1.0 + STIFFNESS_OFF * rng.uniform(-1.0, 1.0, robot.modules)
     payload_modules = rng.uniform(0.0, PAYLOAD_MODULES) if rng.uniform() < 0.7 else 0.0
-    return Perturbation(tuple(stiffness.tolist()), payload_modules * PLANTS[robot.robot.kind].module_kg)
+    return Perturbation(tuple(stiffness.tolist()), payload_modules * PLANTS[robot.kind].module_kg)
 
 
 def episodes(recipe: dict[str, Any], robot: Robot, indices: list[int], simulate: Simulate) -> list[Episode]:
@@ -90,7 +90,7 @@ def _alike(
 
 def recipe_of(robot: Robot, strategy: str, seed: int, steps: int, simulator: str) -> dict[str, Any]:
     """All that the numbers of a data set depend on, apart from how many episodes there are. `simulator` is its name."""
-    parameters = json.dumps(asdict(PLANTS[robot.robot.kind]), sort_keys=True)
+    parameters = json.dumps(asdict(PLANTS[robot.kind]), sort_keys=True)
     recipe = {
         "schema": dataset.SCHEMA,
         "robot": robot.to_dict(),

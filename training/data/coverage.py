@@ -83,7 +83,7 @@ def compare(paths: list[Path]) -> list[Coverage]:
     """The coverage of each data set, at the number of samples of the smallest; `ModelError` unless all robots are of
     one kind and module number."""
     sets = [dataset.read(path) for path in paths]
-    robots = {(data.robot.robot.kind, data.robot.modules) for data in sets}
+    robots = {(data.robot.kind, data.robot.modules) for data in sets}
     if len(robots) > 1:
         different = ", ".join(sorted(f"{kind} with {modules} modules" for kind, modules in robots))
         raise ModelError(f"data sets of different robots ({different}); plot them one by one")

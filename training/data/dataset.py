@@ -189,7 +189,7 @@ def split(data: DataSet, history: int, how: str, seed: int) -> tuple[Windows, Wi
     how: "blocks" cuts contiguous blocks of time and drops every window that reaches over a cut; "shuffled" deals
     single windows at random as the paper does, which leaks, since neighbouring windows share most of their content.
     """
-    kind = data.robot.robot.kind
+    kind = data.robot.kind
     states = state_of(data.configuration, kind)
     features = np.stack([episode_features(s, a, history) for s, a in zip(states, data.action, strict=True)])
     features, targets = features.astype(np.float32), data.action.astype(np.float32)

@@ -64,13 +64,13 @@ def by_fleet(
     robot: Robot, actions: Array, variant: str | None = None, *, perturbation: Perturbation | None = None
 ) -> Array:
     """Robots side by side in compiled code."""
-    fleet = Fleet(robot.robot.kind, robot.modules, len(actions), variant=variant, **_overrides(perturbation))
+    fleet = Fleet(robot.kind, robot.modules, len(actions), variant=variant, **_overrides(perturbation))
     return _run(fleet, actions, robot.loop.period_s)
 
 
 def by_elastica(robot: Robot, actions: Array, *, perturbation: Perturbation | None = None) -> Array:
     """One robot after the other in PyElastica, the reference."""
-    arms = Arms(robot.robot.kind, robot.modules, len(actions), **_overrides(perturbation))
+    arms = Arms(robot.kind, robot.modules, len(actions), **_overrides(perturbation))
     return _run(arms, actions, robot.loop.period_s)
 
 
@@ -84,7 +84,7 @@ def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:
 
 def _check(robot: Robot) -> None:
     """What the robot file says and the simulated robot cannot do."""
-    plant, period_s = PLANTS[robot.robot.kind], robot.loop.period_s
+    plant, period_s = PLANTS[robot.kind], robot.loop.period_s
     steps = period_s / plant.time_step_s
     if abs(steps - round(steps)) > 1e-6 * steps:
         raise RobotFileError(
