@@ -17,6 +17,16 @@
 static struct supervisor board;
 static struct sensors inputs;
 
+// Fails when the converter stops: the supervisor would then compare readings that never change.
+static uint8_t take_reading() { return sensors_poll(&inputs) ? CHECK_ADC : 0; }
+
+static uint8_t drive_pins() {
+  for (uint8_t channel = 0; channel < CHANNELS_USED; channel++) {
+    pwm_write(channel, supervisor_counts(&board, channel));
+  }
+  return CHECK_PINS;
+}
+
 void setup() {
   pwm_begin();
   sensors_begin(&inputs);
@@ -39,11 +49,10 @@ void loop() {
   }
   if (now_ms != last_ms) {  // every byte wakes us; a millisecond is soon enough for all the rest
     last_ms = now_ms;
-    sensors_poll(&inputs);
-    const uint8_t checks = supervisor_update(&board, inputs.measured, inputs.supply_mv, now_ms);
-    for (uint8_t channel = 0; channel < CHANNELS_USED; channel++) {
-      pwm_write(channel, supervisor_counts(&board, channel));
-    }
+    uint8_t checks = 0;
+    checks |= take_reading();
+    checks |= supervisor_update(&board, inputs.measured, inputs.supply_mv, now_ms);
+    checks |= drive_pins();
     if (checks == CHECK_ALL) {
       boot_feed_watchdog(now_ms);
     }

@@ -1,7 +1,5 @@
 #include "sensors.h"
 
-#include <stdbool.h>
-
 #include <avr/io.h>
 
 #include "limits.h"
@@ -52,10 +50,10 @@ void sensors_begin(struct sensors *sensors) {
   start(sensors->input);
 }
 
-void sensors_poll(struct sensors *sensors) {
+bool sensors_poll(struct sensors *sensors) {
   uint16_t reading;
   if (ADCSRA & _BV(ADSC)) {
-    return;
+    return false;
   }
   reading = ADC;
   if (sensors->input < INPUTS) {
@@ -66,4 +64,5 @@ void sensors_poll(struct sensors *sensors) {
   }
   next(sensors);
   start(sensors->input);
+  return true;
 }

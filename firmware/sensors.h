@@ -2,6 +2,7 @@
 #ifndef SENSORS_H
 #define SENSORS_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "protocol.h"
@@ -19,8 +20,8 @@ struct sensors {
 
 void sensors_begin(struct sensors *sensors);
 
-/* Takes the result of the last conversion when it is there, and starts the next. */
-void sensors_poll(struct sensors *sensors);
+/* Takes the result of the last conversion and starts the next. Returns false while the conversion still runs. */
+bool sensors_poll(struct sensors *sensors);
 
 #ifdef __cplusplus
 }

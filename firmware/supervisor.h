@@ -19,8 +19,17 @@
 extern "C" {
 #endif
 
-/* The checks of one pass; the hardware watchdog is fed only after all of them. */
-enum check { CHECK_LINK = 1, CHECK_CONTROL = 2, CHECK_SENSORS = 4, CHECK_OUTPUTS = 8, CHECK_ALL = 15 };
+/* Each check of a pass sets its bit when it ends. Only a pass with all bits feeds the hardware watchdog. */
+enum check {
+  CHECK_LINK = 1,
+  CHECK_CONTROL = 2,
+  CHECK_SENSORS = 4,
+  CHECK_OUTPUTS = 8,
+  CHECK_UPDATE = 15, /* those of supervisor_update */
+  CHECK_ADC = 16,    /* the sketch's: the converter delivers readings */
+  CHECK_PINS = 32,   /* the sketch's: every pin has its counts */
+  CHECK_ALL = 63
+};
 
 struct supervisor {
   uint8_t state;   /* enum state */
@@ -64,7 +73,7 @@ void supervisor_init(struct supervisor *s, uint32_t boot_id, uint8_t reset_cause
 bool supervisor_receive(struct supervisor *s, uint8_t byte, uint32_t now_ms);
 
 /* Once a loop: timers, faults, outputs, STATUS. measured is in 10 Pa, PROTOCOL_NOT_MEASURED where there is no sensor.
- * Returns the checks done, CHECK_ALL when all is well; then, and only then, the watchdog may be fed. */
+ * Returns the bits of its checks, CHECK_UPDATE. */
 uint8_t supervisor_update(struct supervisor *s, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,
                           uint32_t now_ms);
 

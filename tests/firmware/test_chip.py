@@ -37,6 +37,7 @@ class Chip:
         self.code = ctypes.CDLL(str(library))
         self.code.boot_next_id.restype = ctypes.c_uint32
         self.code.boot_reset_cause.restype = ctypes.c_uint8
+        self.code.sensors_poll.restype = ctypes.c_bool
         self.registers = (ctypes.c_uint8 * 0x200).in_dll(self.code, "chip")
         self.millis = ctypes.c_ulong.in_dll(self.code, "timer0_millis")
         self.watchdog_is_on = ctypes.c_int.in_dll(self.code, "watchdog_is_on")
@@ -115,7 +116,7 @@ def convert(chip, sensors, reading):
     source = chip.registers[ADMUX]
     chip.registers[ADCL], chip.registers[ADCL + 1] = reading & 0xFF, reading >> 8
     chip.registers[ADCSRA] &= ~CONVERTING
-    chip.code.sensors_poll(ctypes.byref(sensors))
+    assert chip.code.sensors_poll(ctypes.byref(sensors))
     return source
 
 
@@ -142,7 +143,7 @@ def test_nothing_is_measured_before_its_first_reading(chip):
 def test_a_conversion_is_never_waited_for(chip):
     sensors = begin(chip)
     before = bytes(sensors)
-    chip.code.sensors_poll(ctypes.byref(sensors))
+    assert not chip.code.sensors_poll(ctypes.byref(sensors))
     assert bytes(sensors) == before
 
 

@@ -22,7 +22,7 @@ DRIVER = HERE / "drive_board.py"
 TIMEOUT_S = 5.0
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def simavr() -> None:
     """For a test that needs simavr; without it, skipped."""
     if missing := emulator.missing_packages("simavr"):

@@ -63,7 +63,7 @@ static void loop(void) {
     tx_free = (tx_free > now ? tx_free : now) + byte_ticks;
     line_send(tx_free, (uint8_t)byte, BAUD);
   }
-  if (checks == CHECK_ALL) {
+  if (checks == CHECK_UPDATE) {
     watchdog_fed = now;
   }
 }
