@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.choices import CORRECTIONS
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import RobotFileError, UsageError
 
@@ -122,7 +123,7 @@ def _somebody_there() -> bool:
     "--correction",
     default="none",
     show_default=True,
-    type=click.Choice(["none", "integral"]),
+    type=click.Choice(CORRECTIONS),
     help="integral: the accumulated configuration error shifts what the model is asked for.",
 )
 @click.option(

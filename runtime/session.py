@@ -152,7 +152,7 @@ def run(options: Options) -> None:
                     stop,
                     log.put,
                     tally,
-                    correction.named(options.correction, robot.modules),
+                    correction.by_name(options.correction, robot.modules),
                     WarmUp(robot, controller.actuate, judge, log.put),
                 ).run(rest)
         except BaseException as raised:  # noqa: BLE001 - raised again below, after the venting

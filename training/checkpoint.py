@@ -2,7 +2,7 @@
 
     schema      int, SCHEMA
     robot       the robot file of the data set, as plain values
-    network     {"name": one of networks.NETWORKS, "feature_size", "action_size", "layers", "hidden", "dropout",
+    network     {"name": one of runtime.choices.NETWORKS, "feature_size", "action_size", "layers", "hidden", "dropout",
                 "history", and "modules" where it is bound to a number of modules}
     features    ordered names of the F features
     weights     state dict

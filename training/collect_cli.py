@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.choices import STRATEGIES
 from modsoft.runtime.entry_point import entry, renamed_option
 from modsoft.runtime.files import check_not_input, check_writable
 
@@ -25,7 +26,7 @@ from modsoft.runtime.files import check_not_input, check_writable
 @click.option(
     "--strategy",
     default="staged",
-    type=click.Choice(["staged", "random", "smooth", "varied"]),
+    type=click.Choice(STRATEGIES),
     help="staged: modules share one action sequence at first, fewer of them in every stage. random: each its own. "
     "smooth: actions that wander, as tasks move. varied: the same on robots of other stiffness and payload.",
 )
@@ -86,7 +87,7 @@ def cli(
     from modsoft.training.data.collect import collect
     from modsoft.training.simulation import simulators
 
-    chosen = simulators.fastest(robot) if simulator is None else simulators.named(simulator, robot)
+    chosen = simulators.fastest(robot) if simulator is None else simulators.by_name(simulator, robot)
     if simulator is None and chosen.name == "elastica":
         click.echo("the fast simulator is not built (no C compiler at installation?): PyElastica, slower", err=True)
     bar: tqdm | None = None

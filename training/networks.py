@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from modsoft.runtime.choices import NETWORKS
 from modsoft.runtime.errors import ModelError
 
 
@@ -102,9 +103,6 @@ class ModuleLSTM(nn.Module):
             )
         own = [network(features[:, i : i + 1]) for i, network in enumerate(self.networks)]
         return torch.cat(own, dim=1)
-
-
-NETWORKS = ("bilstm", "lstm", "module-lstm")
 
 
 def build(description: dict[str, Any]) -> nn.Module:

@@ -51,7 +51,7 @@ class Settings:
     """What the weights depend on, together with the data."""
 
     history: int  # T
-    network: str = "bilstm"  # one of networks.NETWORKS
+    network: str = "bilstm"  # one of choices.NETWORKS
     batch: int = 64
     truncation_probability: float = 0.0  # of a step that takes the robot's last modules for a robot of their own
     iterations: int = 6000

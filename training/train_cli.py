@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from modsoft.runtime.choices import NETWORKS
 from modsoft.runtime.entry_point import entry, renamed_option
 from modsoft.runtime.errors import UsageError
 from modsoft.runtime.files import check_not_input, check_writable, target_of
@@ -21,7 +22,7 @@ from modsoft.runtime.files import check_not_input, check_writable, target_of
 @click.option(
     "--network",
     default="bilstm",
-    type=click.Choice(["bilstm", "lstm", "module-lstm"]),
+    type=click.Choice(NETWORKS),
     help="bilstm serves any number of modules; lstm (all modules in one) and module-lstm (one each) only the data's.",
 )
 @click.option("--iterations", default=6000, type=click.IntRange(1), help="Steps of the optimiser.")

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from modsoft.runtime.arrays import Array
+from modsoft.runtime.choices import CORRECTIONS
 from modsoft.runtime.errors import UsageError
 
 # How much of an error that stays the same is taken off in each period. Chosen on random smooth references of four and
@@ -78,11 +79,11 @@ def _across(vectors: Array, directions: Array) -> Array:
     return vectors - np.sum(vectors * directions, axis=-1, keepdims=True) * directions
 
 
-def named(name: str, modules: int) -> Correction:
-    """A new correction by its name; `UsageError` for a name that there is not."""
+def by_name(name: str, modules: int) -> Correction:
+    """A new correction for one run; name: one of `CORRECTIONS`, `UsageError` for any other."""
     match name:
         case "none":
             return NoCorrection()
         case "integral":
             return IntegralCorrection(modules)
-    raise UsageError(f"no correction {name!r}; expected none or integral")
+    raise UsageError(f"no correction {name!r}; expected {' or '.join(CORRECTIONS)}")

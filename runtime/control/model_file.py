@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from modsoft.runtime.choices import NetworkName
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_is_file
 
@@ -43,7 +44,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 class Network(Record, frozen=True, omit_defaults=True):
     """Which network of Table S1, and its sizes."""
 
-    name: Literal["bilstm", "lstm", "module-lstm"]
+    name: NetworkName
     feature_size: Size
     action_size: Size
     layers: Size

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from modsoft.runtime.control.correction import IntegralCorrection, NoCorrection, named
+from modsoft.runtime.control.correction import IntegralCorrection, NoCorrection, by_name
 from modsoft.runtime.control.tasks import next_reference, task
 from modsoft.runtime.errors import UsageError
 
@@ -79,7 +79,7 @@ def test_a_saturated_module_lets_go_and_may_always_be_asked_for_less():
 
 
 def test_corrections_by_name():
-    assert isinstance(named("none", 3), NoCorrection)
-    assert named("integral", 3).sum.shape == (3, 3)
+    assert isinstance(by_name("none", 3), NoCorrection)
+    assert by_name("integral", 3).sum.shape == (3, 3)
     with pytest.raises(UsageError, match="'pid'; expected none or integral"):
-        named("pid", 3)
+        by_name("pid", 3)

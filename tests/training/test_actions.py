@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_robots import of_modules
 
+from modsoft.runtime.choices import STRATEGIES
 from modsoft.runtime.control.actuation import limited
 from modsoft.training.data import actions as a
 
@@ -33,7 +34,7 @@ def test_staged_actions_are_alike_in_the_first_modules_of_each_stage(modules, st
                 assert not np.any(piece[:, module] == piece[:, other])
 
 
-@given(st.integers(2, 5), st.sampled_from([0.05, 0.4, 1.0]), st.sampled_from(a.STRATEGIES), st.integers(0, 99))
+@given(st.integers(2, 5), st.sampled_from([0.05, 0.4, 1.0]), st.sampled_from(STRATEGIES), st.integers(0, 99))
 def test_the_loop_would_send_every_drawn_action_as_it_is(modules, largest, strategy, seed):
     actions = draw(of_modules("cable", modules, largest), strategy, 200, seed)
     previous = np.zeros_like(actions[0])  # every episode starts with the actuation at rest

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from modsoft.runtime.choices import NETWORKS
 from modsoft.runtime.control.features import feature_names, features
 from modsoft.runtime.errors import ModelError
 from modsoft.training import networks
@@ -42,7 +43,7 @@ def heard(network, x):
 
 def test_every_network_gives_the_actuation_of_every_module():
     x, _, _ = windows()
-    for name in networks.NETWORKS:
+    for name in NETWORKS:
         assert made(name)(x).shape == (3, N, A)
 
 
@@ -106,7 +107,7 @@ def test_sizes_of_table_s1():
 
 def test_dropout_is_between_layers_and_in_training_only():
     x, _, _ = windows()
-    for name in networks.NETWORKS:
+    for name in NETWORKS:
         network = made(name, dropout=0.5)
         assert torch.equal(network(x), network(x))
         network.train()

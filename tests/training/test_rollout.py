@@ -149,7 +149,7 @@ def test_correction_removes_a_constant_error_of_the_policy():
 
     # Task "down" stays within 90 degrees, where v_x determines the angle.
     desired = tasks.task("down", "pneumatic", 3)
-    setups = [setup("down", biased), setup("down", biased, correction=correction.named("integral", 3))]
+    setups = [setup("down", biased), setup("down", biased, correction=correction.by_name("integral", 3))]
     alone, corrected = rollout(RobotsOfAngles(3, 2), setups).robots()
     np.testing.assert_allclose(r.angle_errors_deg(alone.configuration, desired)[1:], 3.0, atol=1e-6)
     assert r.angle_errors_deg(corrected.configuration, desired)[20:].max() < 0.1

@@ -98,15 +98,15 @@ def test_a_plant_is_had_by_its_name():
     robot = robots.load("pneumatic-2")
     assert simulators.names()[-1] == "elastica"
     assert simulators.fastest(robot).name == simulators.names()[0]
-    assert simulators.named("elastica", robot).simulate is simulators.by_elastica
+    assert simulators.by_name("elastica", robot).simulate is simulators.by_elastica
     with pytest.raises(UsageError, match=r"the simulator fleet-other does not run here; expected .*elastica"):
-        simulators.named("fleet-other", robot)
+        simulators.by_name("fleet-other", robot)
 
 
 @needs_fleet
 def test_a_named_variant_gives_the_same_bits_everywhere():
     robot, actions = draw("pneumatic-2", 2, 3)
-    plain = simulators.named("fleet-plain", robot).simulate(robot, actions)
+    plain = simulators.by_name("fleet-plain", robot).simulate(robot, actions)
     np.testing.assert_array_equal(plain, simulators.by_fleet(robot, actions, "plain"))
     np.testing.assert_allclose(plain, simulators.fastest(robot).simulate(robot, actions), rtol=0, atol=1e-9)
 

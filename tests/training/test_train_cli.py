@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.choices import NETWORKS
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.training import checkpoint as checkpoints
-from modsoft.training import networks, train_cli
+from modsoft.training import train_cli
 from modsoft.training.data import dataset
 
 QUICK = ["--iterations", "60", "--history", "3", "--batch", "8"]
@@ -75,7 +76,7 @@ def test_the_network_asked_for_is_trained(folder):
     made = checkpoints.load(folder / "m.pt")
     assert (made["network"]["name"], made["provenance"]["truncation_probability"]) == ("lstm", 0.0)
     choice = next(option for option in train_cli.cli.params if option.name == "network").type
-    assert tuple(choice.choices) == networks.NETWORKS
+    assert tuple(choice.choices) == NETWORKS
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 
 from modsoft.runtime import robot as robots
+from modsoft.runtime.choices import CORRECTIONS
 from modsoft.runtime.control import correction, tasks
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.entry_point import entry
@@ -21,7 +22,6 @@ from modsoft.training.simulation.rollout import ControllerSetup, angle_errors_de
 MODELS = Path(__file__).resolve().parents[1] / "models"
 FLOWN = [("pneumatic-3", "pneumatic-3"), ("pneumatic-3", "pneumatic-2"), ("cable-4", "cable-4"), ("cable-4", "cable-6")]
 QUICK_STEPS = 20
-CORRECTIONS = ("none", "integral")
 
 
 def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]:
@@ -34,7 +34,7 @@ def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]
         desired = tasks.task(task, kind, robot.modules)[:steps]
         pilots.append(
             ControllerSetup(
-                robot, controller.actuate, controller.history, desired, correction.named(each, robot.modules)
+                robot, controller.actuate, controller.history, desired, correction.by_name(each, robot.modules)
             )
         )
     errors = angle_errors_deg if kind == "pneumatic" else configuration_errors_percent

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from modsoft.runtime.choices import CORRECTIONS
 from modsoft.study import measurements, paper, rollouts
 from modsoft.study.cells import Cell, cell, pick
 from modsoft.study.measurements import CONTROL, ESTIMATION, Record
 from modsoft.study.paths import Folder
-from modsoft.study.plan import CORRECTIONS, MAIN, TASKS, Model, Plan, Run
+from modsoft.study.plan import MAIN, TASKS, Model, Plan, Run
 from modsoft.training import plotting
 from modsoft.training.data import coverage
 from modsoft.training.simulation.rollout import configuration_errors_percent

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from modsoft.runtime.choices import CORRECTIONS
+
 TASKS = ("A", "B", "C")
-CORRECTIONS = ("none", "integral")
 SPLITS = ("blocks", "shuffled")
 # What the robot or its tracker suffers; `disturb.py` does it.
 DISTURBANCES = ("noise", "lost", "stiffness", "payload")

@@ -110,7 +110,7 @@ def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: Told) -> 
             models[run.model].actuate,
             models[run.model].history,
             desired_of(plan, run.task, run.modules),
-            corrections.named(run.correction, run.modules),
+            corrections.by_name(run.correction, run.modules),
             perturbations.measure(run.disturbance, run.modules, run.model.seed),
         )
         for run in batch

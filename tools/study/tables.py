@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from modsoft.runtime.choices import CORRECTIONS
 from modsoft.study import paper
 from modsoft.study.cells import Cell, cell, mark, pick, ratio, table
 from modsoft.study.measurements import CONTROL, COVERED, ESTIMATION, TIP_DISTANCE, TIP_TILT, Record
 from modsoft.study.perturbations import WORDS
-from modsoft.study.plan import CORRECTIONS, MAIN, SPLITS, TASKS
+from modsoft.study.plan import MAIN, SPLITS, TASKS
 
 NETWORK_WORDS = {"module-lstm": "four LSTM", "lstm": "LSTM", "bilstm": "biLSTM"}
 SPLIT_WORDS = {"blocks": "contiguous blocks", "shuffled": "shuffled windows"}

@@ -11,8 +11,6 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.actuation import limited
 from modsoft.runtime.robot import Robot
 
-# varied: smooth, on robots that differ from the drawing (`collect.perturbation_of`).
-STRATEGIES = ("staged", "random", "smooth", "varied")
 JITTER = (0.003, 0.3)  # of smooth actions, smallest and largest
 KNOTS = (4.0, 60.0)  # steps from one random action to the next on the way of a smooth sequence, quickest and slowest
 OVER = 1.3  # knots are drawn from a range this much larger and cut to it, so that its ends are visited

@@ -40,7 +40,7 @@ class Simulator(NamedTuple):
 
 def fastest(robot: Robot) -> Simulator:
     """The compiled fleet where this installation has it, else PyElastica."""
-    return named(names()[0], robot)
+    return by_name(names()[0], robot)
 
 
 def names() -> list[str]:
@@ -49,7 +49,7 @@ def names() -> list[str]:
     return [*(f"fleet-{variant}" for variant in reversed(fleet_kernel.variants())), "elastica"]
 
 
-def named(name: str, robot: Robot) -> Simulator:
+def by_name(name: str, robot: Robot) -> Simulator:
     """The plant of that name; `UsageError` where it does not run here, `RobotFileError` if it cannot be this robot."""
     if name not in names():
         raise UsageError(f"the simulator {name} does not run here; expected {', '.join(names())}")
