@@ -54,7 +54,7 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
 
     exported = export(model, out, meta)
     report, said = exported.report, exported.description
-    click.echo(f"{exported.path}: {exported.path.stat().st_size / 1e6:.1f} MB, seal {said.file_sha256}")
+    click.echo(f"{exported.path}: {exported.path.stat().st_size / 1e6:.1f} MB, SHA-256 {said.file_sha256}")
     modules = ", ".join(map(str, said.modules_trained_on))
     bound = "" if said.network.modules is None else " and bound to them"
     click.echo(f"for {said.kind} robots at {1.0 / said.period_s:g} Hz, trained on {modules} modules{bound}")

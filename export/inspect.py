@@ -18,7 +18,7 @@ def print_model(path: Path) -> None:
     said = Model.load(path).description
     model = onnx.load(path, load_external_data=False)
     operators = Counter(node.op_type for node in model.graph.node)
-    print(f"{path}: {path.stat().st_size} bytes; seal, description and golden pairs hold")
+    print(f"{path}: {path.stat().st_size} bytes; checksum, description and golden pairs are valid")
     print(f"graph: IR version {model.ir_version}, opset {model.opset_import[0].version}, {operators.total()} nodes")
     print(f"  operators: {', '.join(f'{count} {name}' for name, count in sorted(operators.items()))}")
     defaults = {tensor.name for tensor in model.graph.initializer}

@@ -20,7 +20,7 @@ from modsoft.export import bilstm_graph
 from modsoft.export.nodes import Weights
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import labels
-from modsoft.runtime.control.model import FixedSizeUnit, Unit, unit_of
+from modsoft.runtime.control.model import FixedSizeUnit, Unit, open_unit
 from modsoft.runtime.control.model_file import FEATURES, FROM_NEIGHBOURS, IR_VERSION, OPSET, Network
 from modsoft.runtime.errors import ModelError
 
@@ -137,7 +137,7 @@ def verify(path: Path, network: torch.nn.Module, sizes: Network, expected: Refer
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     check_graph(path)
     check_weights(path, weights, sizes)
-    unit = unit_of(path.read_bytes(), str(path))
+    unit = open_unit(path.read_bytes(), str(path))
     fused = check_fused(unit, expected)
     # A network bound to its number of modules has no neighbours that hand it states.
     chain, one_sweep_fewer = check_chain(unit, expected) if isinstance(unit, Unit) else ({}, {})

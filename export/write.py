@@ -74,11 +74,11 @@ def _check_own(out: Path) -> None:
 
 
 def describe(checkpoint: dict[str, Any], sizes: Network, weights: Weights, expected: parity.Reference) -> Description:
-    """The description of the model to be, its seal not yet set."""
+    """The description of the model to be, its checksum not yet set."""
     robot = robots.from_dict(checkpoint["robot"])
     return Description(
         schema=model_file.SCHEMA,
-        file_sha256=model_file.UNSEALED,
+        file_sha256=model_file.CHECKSUM_PLACEHOLDER,
         weights_sha256=parity.weights_sha256(weights),
         opset=model_file.OPSET,
         ir_version=model_file.IR_VERSION,

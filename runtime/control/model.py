@@ -1,8 +1,8 @@
-"""The controller: the exported biLSTM unit, run over all modules of the robot in one go or as a chain of units, or an
-exported network that is bound to its number of modules.
+"""The exported network in onnxruntime: the biLSTM, over all modules in one run or as a chain of single-module units,
+or a network for a fixed number of modules.
 
-`Model.load` believes nothing: the seal, the description, the graph's border and the golden pairs are all proven
-before the first control step, and `check` proves that model and robot belong together.
+`Model.load` verifies the checksum, the description, the graph's interface and the golden pairs before the first
+control step; `Model.check` verifies that the model fits the robot.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from modsoft.runtime.control.ort import onnxruntime, onnxruntime_errors
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.robot import KINDS, Robot
 
-LARGEST = float(np.finfo(np.float32).max)  # a larger feature is infinite in the network
+LARGEST = float(np.finfo(np.float32).max)  # a larger feature becomes infinite in float32
 
-# What a session raises for a graph that it cannot take.
-REFUSED = (
+# Raised by onnxruntime for an invalid graph.
+INVALID_GRAPH = (
     onnxruntime_errors.Fail,
     onnxruntime_errors.InvalidArgument,
     onnxruntime_errors.InvalidGraph,
@@ -33,35 +33,35 @@ REFUSED = (
 )
 
 
-def _opened(model: bytes, where: str) -> onnxruntime.InferenceSession:
+def _open_session(model: bytes, where: str) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1  # more gains nothing below 16 modules, and collapses beside a busy process
+    options.intra_op_num_threads = 1  # more threads do not help below 16 modules, and stall on a busy machine
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    # A stranger's model gets no other file: weights outside it would be read from the current folder, and the other
-    # format that onnxruntime takes is one that no check here knows.
+    # An untrusted model must not read other files: external weights would be read from the current folder. The ORT
+    # format is disabled because the checks here only cover ONNX.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
     options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
         return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except REFUSED as error:
+    except INVALID_GRAPH as error:
         first = str(error).splitlines()[0]
         raise ModelError(f"{where}: onnxruntime {onnxruntime.__version__} refuses it ({first})") from error
 
 
 def _actuation(session: onnxruntime.InferenceSession, features: ArrayLike) -> Array:
-    """Features (N, F) to actuation (N, A) in one run."""
+    """Features (N, F) to actuation (N, A)."""
     segment = np.asarray(features, dtype=np.float32)[None]
     return session.run([ACTUATION], {FEATURES: segment})[0][0].astype(np.float64)
 
 
 class Unit:
-    """The graph over a segment of contiguous modules, in onnxruntime (Figure 1-(D))."""
+    """The biLSTM's graph over a segment of contiguous modules, in onnxruntime (Figure 1-(D))."""
 
-    modules: int | None = None  # that it is bound to: none
+    modules: int | None = None  # any number
 
     def __init__(self, session: onnxruntime.InferenceSession, where: str = "model"):
-        """`where` is named in the errors."""
+        """where: name of the file, for errors. Raises `ModelError` for another interface than `model_file` defines."""
         self.session = session
         self.where = where
         self._check_interface()
@@ -75,25 +75,25 @@ class Unit:
         session = self.session
         inputs, states, outputs = session.get_inputs(), session.get_overridable_initializers(), session.get_outputs()
         names = ([i.name for i in inputs], sorted(i.name for i in states), [o.name for o in outputs])
-        wanted = ([FEATURES], sorted(FROM_NEIGHBOURS), [ACTUATION, *TO_NEIGHBOURS])
-        if names != wanted:
-            raise ModelError(f"{self.where}: inputs, states, outputs are {names}, expected {wanted}; export it again")
-        exchanged = {tuple(value.shape) for value in [*states, *outputs[1:]]}
-        if len(exchanged) != 1 or any(len(value.shape) != 3 for value in [*inputs, *outputs]):
-            raise ModelError(f"{self.where}: states of shapes {sorted(exchanged)}, expected one shape (L, 1, H)")
+        expected = ([FEATURES], sorted(FROM_NEIGHBOURS), [ACTUATION, *TO_NEIGHBOURS])
+        if names != expected:
+            raise ModelError(f"{self.where}: inputs, states, outputs are {names}, expected {expected}; export it again")
+        state_shapes = {tuple(value.shape) for value in [*states, *outputs[1:]]}
+        if len(state_shapes) != 1 or any(len(value.shape) != 3 for value in [*inputs, *outputs]):
+            raise ModelError(f"{self.where}: states of shapes {sorted(state_shapes)}, expected one shape (L, 1, H)")
         modules = {str(value.shape[1]) for value in (inputs[0], outputs[0])}
         if modules != {"N"}:
-            raise ModelError(f"{self.where}: made for {modules} modules, expected any number N; export it again")
+            raise ModelError(f"{self.where}: found modules axis {modules}, expected any number N; export it again")
 
     def whole(self, features: ArrayLike) -> Array:
-        """Features (N, F) of all modules to actuation (N, A): one run, no neighbours beyond the ends."""
+        """Features (N, F) of all modules to actuation (N, A) in one run; zero states at both ends."""
         return _actuation(self.session, features)
 
     def chain(self, features: ArrayLike, sweeps: int | None = None) -> Array:
-        """The same by single modules that know only their neighbours' states, in alternating sweeps, base to tip first.
+        """Features (N, F) to actuation (N, A) by single-module units that exchange states with their neighbours.
 
-        In a stack of L layers both directions of a layer feed the next, so L + 1 sweeps (the default) reach the
-        result of `whole`, fewer do not.
+        Sweeps alternate in direction, base to tip first. In a stack of L layers both directions of a layer feed the
+        next, so L + 1 sweeps (the default) reach the result of `whole`, and fewer do not.
         """
         segment = np.asarray(features, dtype=np.float32)
         modules = len(segment)
@@ -111,16 +111,16 @@ class Unit:
 
 
 class FixedSizeUnit:
-    """The graph of a network that is bound to its number of modules N (Table S1: LSTM, four LSTM), in onnxruntime."""
+    """The graph of a network for a fixed number of modules N (Table S1: LSTM, four LSTM), in onnxruntime."""
 
     def __init__(self, session: onnxruntime.InferenceSession, where: str = "model"):
-        """`where` is named in the errors."""
+        """where: name of the file, for errors. Raises `ModelError` for another interface than `model_file` defines."""
         self.session = session
         self.where = where
         inputs, outputs = session.get_inputs(), session.get_outputs()
-        names, wanted = ([i.name for i in inputs], [o.name for o in outputs]), ([FEATURES], [ACTUATION])
-        if names != wanted:
-            raise ModelError(f"{where}: inputs and outputs are {names}, expected {wanted}; export it again")
+        names, expected = ([i.name for i in inputs], [o.name for o in outputs]), ([FEATURES], [ACTUATION])
+        if names != expected:
+            raise ModelError(f"{where}: inputs and outputs are {names}, expected {expected}; export it again")
         shapes = [inputs[0].shape, outputs[0].shape]
         if any(len(shape) != 3 or not all(isinstance(size, int) for size in shape) for shape in shapes):
             raise ModelError(f"{where}: features, actuation of shapes {shapes}, expected fixed (1, N, F) and (1, N, A)")
@@ -134,15 +134,15 @@ class FixedSizeUnit:
         return _actuation(self.session, features)
 
 
-def unit_of(model: bytes, where: str = "model") -> Unit | FixedSizeUnit:
-    """A serialised ONNX model, ready to run: a unit where it takes neighbours' states, else one bound to its number of
-    modules. `ModelError` for any other; `where` is named in it."""
-    session = _opened(model, where)
+def open_unit(model: bytes, where: str = "model") -> Unit | FixedSizeUnit:
+    """Opens a serialised ONNX model: a `Unit` if it has neighbours' states, else a `FixedSizeUnit`. `ModelError` for
+    any other graph; where: name of the file, for errors."""
+    session = _open_session(model, where)
     return Unit(session, where) if session.get_overridable_initializers() else FixedSizeUnit(session, where)
 
 
 class Model:
-    """A model file, proven and ready to run. `description` says what it is, `history` is its T."""
+    """A verified model file, ready to run: `description` from the file, `history` T."""
 
     def __init__(self, unit: Unit | FixedSizeUnit, description: Description):
         self.unit = unit
@@ -151,20 +151,20 @@ class Model:
 
     @classmethod
     def load(cls, path: str | Path) -> Model:
-        """Opens a model file; `ModelError` for one that is damaged, of another schema, at odds with its own
-        description, or that answers the golden pairs otherwise than torch did."""
+        """Opens a model file. `ModelError` if it is damaged, has another schema, contradicts its own description, or
+        does not reproduce the golden pairs."""
         path = Path(path)
         try:
-            unit = unit_of(model_file.read(path), str(path))
+            unit = open_unit(model_file.read(path), str(path))
             text = unit.session.get_modelmeta().custom_metadata_map.get(model_file.METADATA_KEY)
-        except UnicodeDecodeError as error:  # onnxruntime passes on whatever bytes stand for a text
-            raise ModelError(f"{path}: a text in it is no UTF-8 ({error.reason}); export it again") from error
+        except UnicodeDecodeError as error:  # onnxruntime does not check that a text is UTF-8
+            raise ModelError(f"{path}: found text that is not UTF-8 ({error.reason}); export it again") from error
         if text is None:
             raise ModelError(f"{path}: no metadata {model_file.METADATA_KEY!r}, expected a file of modsoft-export")
-        controller = cls(unit, model_file.describe(text, str(path)))
-        controller._check_description()
-        controller._replay()
-        return controller
+        model = cls(unit, model_file.describe(text, str(path)))
+        model._check_description()
+        model._replay()
+        return model
 
     @property
     def history(self) -> int:
@@ -172,73 +172,79 @@ class Model:
         return self.description.network.history
 
     def _check_description(self) -> None:
-        """The description against the graph it stands in, and against this runtime's feature layout."""
-        said, network, kind = self.description, self.description.network, KINDS.get(self.description.kind)
+        """Compares the description with the graph and with the feature layout of this version."""
+        description, network = self.description, self.description.network
+        kind = KINDS.get(description.kind)
         if kind is None:
-            raise ModelError(f"{self.where}: for a robot of kind {said.kind!r}, expected one of {', '.join(KINDS)}")
+            raise ModelError(
+                f"{self.where}: for a robot of kind {description.kind!r}, expected one of {', '.join(KINDS)}"
+            )
         pairs = {
-            "opset": (said.opset, model_file.OPSET),
-            "IR version": (said.ir_version, model_file.IR_VERSION),
-            "label": (said.label, model_file.LABEL),
-            "state size": (said.state_size, len(kind.state)),
-            "action size": (said.action_size, len(kind.action)),
-            "actuation of the graph": (self.unit.action_size, said.action_size),
-            "features of the graph": (self.unit.feature_size, len(said.features)),
-            "sequence axis": (said.sequence_axis, network.sequence_axis),
+            "opset": (description.opset, model_file.OPSET),
+            "IR version": (description.ir_version, model_file.IR_VERSION),
+            "label": (description.label, model_file.LABEL),
+            "state size": (description.state_size, len(kind.state)),
+            "action size": (description.action_size, len(kind.action)),
+            "actuation of the graph": (self.unit.action_size, description.action_size),
+            "features of the graph": (self.unit.feature_size, len(description.features)),
+            "sequence axis": (description.sequence_axis, network.sequence_axis),
             "network": ({name: getattr(network, name) for name in self.unit.sizes}, self.unit.sizes),
-            "time steps T": (network.history, (len(said.features) - 1) // (said.state_size + said.action_size)),
-            "features": (said.features, features.feature_names(said.kind, network.history)),
+            "time steps T": (
+                network.history,
+                (len(description.features) - 1) // (description.state_size + description.action_size),
+            ),
+            "features": (description.features, features.feature_names(description.kind, network.history)),
         }
-        for name, (found, expected) in pairs.items():
-            if found != expected:
-                raise ModelError(f"{self.where}: {name} {found}, expected {expected}; export it again")
-        if not said.golden:
+        for name, (actual, expected) in pairs.items():
+            if actual != expected:
+                raise ModelError(f"{self.where}: {name} {actual}, expected {expected}; export it again")
+        if not description.golden:
             raise ModelError(f"{self.where}: no golden pair in it, expected one or more; export it again")
 
     def _replay(self) -> None:
-        """The golden pairs: this machine's onnxruntime must answer as torch did where the model was exported."""
+        """Compares the output of this machine's onnxruntime with torch's, on the golden pairs."""
         for pair in self.description.golden:
             expected = np.array(pair.actuation)
-            found = self.actuate(pair.features)
-            error = np.abs(found - expected).max() if found.shape == expected.shape else np.inf
+            actuation = self.actuate(pair.features)
+            error = np.abs(actuation - expected).max() if actuation.shape == expected.shape else np.inf
             if not error <= self.description.tolerance:
                 raise ModelError(
-                    f"{self.where}: a golden pair of {len(pair.features)} modules comes out {error:.2e} off, expected "
+                    f"{self.where}: golden pair of {len(pair.features)} modules: found error {error:.2e}, expected "
                     f"at most {self.description.tolerance:.2e}; export it again, or install another onnxruntime than "
                     f"{onnxruntime.__version__}"
                 )
 
     def check(self, robot: Robot) -> None:
-        """Raises `ModelError` unless the model was trained for robots like this one; their module number is free unless
-        the network is bound to one."""
-        said = self.description
+        """Raises `ModelError` unless the model was trained for this kind of robot and control period, and for this
+        number of modules where the network has a fixed one."""
+        description = self.description
         pairs = {
-            "kind": (said.kind, robot.kind),
-            "state size": (said.state_size, robot.state_size),
-            "action size": (said.action_size, robot.action_size),
-            "period_s": (said.period_s, robot.loop.period_s),
+            "kind": (description.kind, robot.kind),
+            "state size": (description.state_size, robot.state_size),
+            "action size": (description.action_size, robot.action_size),
+            "period_s": (description.period_s, robot.loop.period_s),
         }
         if self.unit.modules is not None:
             pairs["modules"] = (self.unit.modules, robot.modules)
-        wrong = [name for name, (found, expected) in pairs.items() if found != expected]
-        if "period_s" in wrong and np.isclose(said.period_s, robot.loop.period_s, rtol=1e-6, atol=0.0):
-            wrong.remove("period_s")
-        if wrong:
-            found, expected = (", ".join(f"{name} {pairs[name][side]}" for name in wrong) for side in (0, 1))
+        different = [name for name, (trained, actual) in pairs.items() if trained != actual]
+        if "period_s" in different and np.isclose(description.period_s, robot.loop.period_s, rtol=1e-6, atol=0.0):
+            different.remove("period_s")
+        if different:
+            trained, actual = (", ".join(f"{name} {pairs[name][side]}" for name in different) for side in (0, 1))
             raise ModelError(
-                f"{self.where}: trained for {found}; robot {robot.name} has {expected}; "
-                f"give the model (--model) or the robot file (--robot) that belongs to the other"
+                f"{self.where}: trained for {trained}; robot {robot.name} has {actual}; "
+                f"give another model (--model) or another robot file (--robot)"
             )
 
     def warm_up(self, modules: int) -> None:
-        """Runs a few steps of a robot of this many modules, so that the first control step is not the slow one."""
+        """Runs a few steps for this number of modules: the first runs of a session are slow."""
         for _ in range(3):
             self.actuate(np.zeros((modules, self.unit.feature_size)))
 
     def actuate(self, features: ArrayLike) -> Array:
-        """Features (N, F) of this control step to actuation (N, A), not limited. Raises `ModelError` for fewer than
-        two modules, another number than the network is bound to, another number of features, or anything not finite,
-        in or out."""
+        """Features (N, F) of a control step to actuation (N, A), not limited. Raises `ModelError` for fewer than two
+        modules, another number than a fixed-size network has, another number of features, and for features or
+        actuation that are not finite."""
         features = np.asarray(features, dtype=np.float64)
         if features.ndim != 2 or features.shape[0] < 2 or features.shape[1] != self.unit.feature_size:
             raise ModelError(
@@ -246,15 +252,15 @@ class Model:
             )
         if self.unit.modules not in (None, len(features)):
             raise ModelError(
-                f"{self.where}: a robot of {len(features)} modules; the network {self.description.network.name} is "
-                f"bound to {self.unit.modules}, a biLSTM serves any number"
+                f"{self.where}: found a robot of {len(features)} modules, expected {self.unit.modules}: the network "
+                f"{self.description.network.name} has a fixed number; use a biLSTM for any number"
             )
         size = np.abs(features)
         if not size.max() <= LARGEST:
             module, feature = np.argwhere(~(size <= LARGEST))[0]
             name = self.description.features[feature]
-            raise ModelError(f"{self.where}: feature {name} of module {module + 1} is not finite; nothing was computed")
+            raise ModelError(f"{self.where}: feature {name} of module {module + 1} is not finite")
         actuation = self.unit.whole(features)
         if not np.isfinite(actuation).all():
-            raise ModelError(f"{self.where}: the actuation is not finite although every feature is")
+            raise ModelError(f"{self.where}: the actuation is not finite, although all features are")
         return actuation

@@ -1,8 +1,8 @@
-"""What stands in `model.onnx` beside its graph: the names at its border, its description and its seal.
+"""Format of `model.onnx`: names of the graph's inputs and outputs, the description and the checksum.
 
-The description is one JSON document under the metadata key `modsoft`. The seal is the SHA-256 of the whole file with
-the digest's own 64 digits read as zeros: it covers graph, weights and description alike, and is proven on the bare
-bytes, before anything parses them. It finds damage, it does not prove who made the file.
+The description is one JSON document under the metadata key `modsoft`. The checksum is the SHA-256 of the whole file,
+computed with its own 64 digits set to zero. It covers graph, weights and description, and is verified on the raw bytes
+before anything parses them. It detects damage; it does not authenticate the file.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ ACTUATION = "actuation"  # (1, N, A)
 TO_NEIGHBOURS = ("h_to_tip", "c_to_tip", "h_to_base", "c_to_base")  # (L, 1, H) each
 
 LABEL = "2 (i - 1) / (N - 1) - 1 for module i of N: -1 at the base, +1 at the tip (eq. 1)"
-UNSEALED = "0" * 64
-_SEAL = re.compile(rb'"file_sha256":"([0-9a-f]{64})"')
+CHECKSUM_PLACEHOLDER = "0" * 64
+_CHECKSUM_FIELD = re.compile(rb'"file_sha256":"([0-9a-f]{64})"')
 
 Size = Annotated[int, Meta(ge=1)]
 Positive = Annotated[float, Meta(gt=0.0)]
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A part of the description: every key is known, nothing changes after reading."""
+    """A part of the description. Frozen; unknown keys are errors."""
 
 
 class Network(Record, frozen=True, omit_defaults=True):
-    """Which network of Table S1, and its sizes."""
+    """A network of Table S1 and its sizes."""
 
     name: NetworkName
     feature_size: Size
@@ -50,23 +50,23 @@ class Network(Record, frozen=True, omit_defaults=True):
     layers: Size
     hidden: Size
     history: Size  # T, time steps
-    modules: Size | None = None  # N that the network is bound to; the biLSTM takes any
+    modules: Size | None = None  # N, None for the biLSTM, which accepts any N
 
     @property
     def sequence_axis(self) -> Literal["modules", "time"]:
-        """What an element of the sequence is."""
+        """Axis that the recurrence runs along."""
         return "modules" if self.name == "bilstm" else "time"
 
 
 class Golden(Record, frozen=True):
-    """A pair that the runtime replays at start: features (N, F) and the actuation (N, A) that torch gives for them."""
+    """A reference pair that the runtime evaluates at start: features (N, F) and torch's actuation (N, A) for them."""
 
     features: list[list[float]]
     actuation: list[list[float]]
 
 
 class Description(Record, frozen=True):
-    """What the model is, whom it fits and where it comes from."""
+    """What the model is, which robots it fits and how it was generated."""
 
     schema: Literal[1]
     file_sha256: str
@@ -89,7 +89,7 @@ class Description(Record, frozen=True):
 
 
 def describe(text: str, where: str) -> Description:
-    """The description out of its JSON text; `where` is named in the errors."""
+    """Parses a description, JSON text. `where` names the file in the `ModelError`."""
     try:
         schema = msgspec.json.decode(text, type=dict).get("schema")
         if schema != SCHEMA:
@@ -100,34 +100,34 @@ def describe(text: str, where: str) -> Description:
 
 
 def with_checksum(model: bytes) -> bytes:
-    """The serialised model, whose description has `UNSEALED` for a seal, with its seal set. `ModelError` when the
-    provenance, say, has another entry that looks like a seal."""
-    found = list(_SEAL.finditer(model))
-    if len(found) != 1 or found[0][1] != UNSEALED.encode():
-        raise ModelError(f"{len(found)} entries file_sha256 in the model, expected one, unset; rename the others")
-    start, end = found[0].span(1)
+    """A serialised model with its checksum in the place of `CHECKSUM_PLACEHOLDER`. `ModelError` unless the model has
+    exactly one entry `file_sha256`, with the placeholder in it."""
+    fields = list(_CHECKSUM_FIELD.finditer(model))
+    if len(fields) != 1 or fields[0][1] != CHECKSUM_PLACEHOLDER.encode():
+        raise ModelError(f"{len(fields)} entries file_sha256 in the model, expected one, unset; rename the others")
+    start, end = fields[0].span(1)
     return model[:start] + hashlib.sha256(model).hexdigest().encode() + model[end:]
 
 
 def read(path: Path) -> bytes:
-    """The bytes of a model file whose seal holds, else `ModelError`."""
-    check_is_file(path, "model file", "modsoft-export model.pt makes one")
+    """Reads a model file and verifies its checksum. `ModelError` where it cannot be read or is damaged."""
+    check_is_file(path, "model file", "run modsoft-export model.pt")
     try:
         model = path.read_bytes()
     except OSError as error:
         raise ModelError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     if model.startswith(b"PK\x03\x04"):
-        raise ModelError(f"{path}: is a checkpoint or another archive, expected ONNX; run modsoft-export on it first")
-    found = list(_SEAL.finditer(model))
-    if len(found) != 1:
-        raise ModelError(f"{path}: no seal in it: not made by modsoft-export, or cut short; export or copy it again")
-    start, end = found[0].span(1)
+        raise ModelError(f"{path}: found a checkpoint or archive, expected ONNX; run modsoft-export on it first")
+    fields = list(_CHECKSUM_FIELD.finditer(model))
+    if len(fields) != 1:
+        raise ModelError(f"{path}: no checksum: not written by modsoft-export, or truncated; export or copy it again")
+    start, end = fields[0].span(1)
     digest = hashlib.sha256(model[:start])
-    digest.update(UNSEALED.encode())
+    digest.update(CHECKSUM_PLACEHOLDER.encode())
     digest.update(memoryview(model)[end:])
-    if digest.hexdigest().encode() != found[0][1]:
+    if digest.hexdigest().encode() != fields[0][1]:
         raise ModelError(
-            f"{path}: damaged: its SHA-256 is {digest.hexdigest()[:12]}..., its seal says "
-            f"{found[0][1][:12].decode()}...; export or copy it again"
+            f"{path}: damaged: found SHA-256 {digest.hexdigest()[:12]}..., expected "
+            f"{fields[0][1][:12].decode()}... from its checksum; export or copy it again"
         )
     return model

@@ -7,7 +7,7 @@ import torch
 from onnx.reference import ReferenceEvaluator
 
 from modsoft.export import bilstm_graph
-from modsoft.runtime.control.model import unit_of
+from modsoft.runtime.control.model import open_unit
 from modsoft.runtime.control.model_file import ACTUATION, FEATURES, FROM_NEIGHBOURS, TO_NEIGHBOURS, Network
 from modsoft.training.networks import BiLSTM
 
@@ -45,7 +45,7 @@ def test_third_opinion(layers, hidden):
     """onnx's evaluator, onnxruntime and torch agree, in a whole robot and with neighbours' states fed."""
     network, weights = network_and_weights(layers, hidden)
     model = bilstm_graph.build(weights, sizes(layers, hidden), "{}")
-    evaluator, unit = ReferenceEvaluator(model), unit_of(model.SerializeToString())
+    evaluator, unit = ReferenceEvaluator(model), open_unit(model.SerializeToString())
     for modules in (1, 2, 5):
         x = features(modules)
         with torch.no_grad():
@@ -64,7 +64,7 @@ def test_third_opinion(layers, hidden):
 @pytest.mark.parametrize("layers", [1, 2, 3])
 def test_chain_needs_one_sweep_more_than_layers(layers):
     _, weights = network_and_weights(layers, 8)
-    unit = unit_of(bilstm_graph.build(weights, sizes(layers, 8), "{}").SerializeToString())
+    unit = open_unit(bilstm_graph.build(weights, sizes(layers, 8), "{}").SerializeToString())
     for modules in (2, 3, 7):
         x = features(modules)
         whole = unit.whole(x)
@@ -76,7 +76,7 @@ def test_chain_needs_one_sweep_more_than_layers(layers):
 def test_segments_make_the_whole():
     """A robot cut into two segments, each told the other's states: one sweep of each a layer, as for single modules."""
     _, weights = network_and_weights(2, 8)
-    unit = unit_of(bilstm_graph.build(weights, sizes(2, 8), "{}").SerializeToString())
+    unit = open_unit(bilstm_graph.build(weights, sizes(2, 8), "{}").SerializeToString())
     x = features(6)
     to_base, to_tip = {}, {}
     for _ in range(3):

@@ -58,7 +58,7 @@ def test_description_says_what_it_is_bound_to(exported, name):
 @pytest.mark.parametrize("modules", [2, 3, 5, 6])
 def test_another_number_of_modules_is_refused(exported, name, modules):
     controller = Model.load(exported[name][1].path)
-    with pytest.raises(ModelError, match=f"of {modules} modules; the network {name} is bound to 4, a biLSTM serves"):
+    with pytest.raises(ModelError, match=f"of {modules} modules, expected 4: the network {name} has a fixed number"):
         controller.actuate(features(modules))
 
 

@@ -8,7 +8,7 @@ from onnx import helper, numpy_helper
 
 from modsoft.export import bilstm_graph, load, parity, write
 from modsoft.export.write import export
-from modsoft.runtime.control.model import unit_of
+from modsoft.runtime.control.model import open_unit
 from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
 
@@ -170,10 +170,10 @@ def run(check, path, network, sizes, expected):
     if check == "weights":
         return parity.check_weights(path, weights, sizes)
     if check == "fused":
-        return parity.check_fused(unit_of(path.read_bytes()), expected)
+        return parity.check_fused(open_unit(path.read_bytes()), expected)
     if check == "chain":
-        return parity.check_chain(unit_of(path.read_bytes()), expected)
-    return parity.check_guard(unit_of(path.read_bytes()), expected)
+        return parity.check_chain(open_unit(path.read_bytes()), expected)
+    return parity.check_guard(open_unit(path.read_bytes()), expected)
 
 
 @pytest.mark.parametrize("check", CHECKS)
@@ -238,7 +238,7 @@ def test_a_network_that_ignores_its_neighbours_is_refused(sound, tmp_path, make_
                 weight[weight.shape[0] // 4 : weight.shape[0] // 2] = -100.0
     expected = parity.reference(network, sizes)
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    unit = unit_of(bilstm_graph.build(weights, sizes, "{}").SerializeToString())
+    unit = open_unit(bilstm_graph.build(weights, sizes, "{}").SerializeToString())
     parity.check_fused(unit, expected)
     with pytest.raises(ModelError, match="no difference"):
         parity.check_chain(unit, expected)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from corrupted_models import corrupted, with_description_changed, with_fault_above
 from mega_in_run import side_by_side
 from runtime_in_run import SCRIPT, Run, Stand, if_begun
-from spoilt_models import damaged, redescribed, running_wild
 from virtual_loop import World
 
 from modsoft.hil.board.emulator import EmulatedBoard
@@ -53,13 +53,13 @@ def untouched(board):
 
 
 def test_row_20_damaged_model_file(matrix_row, full, model_file, tmp_path):
-    sound, generator, spoilt, worst_s = model_file.read_bytes(), random.Random(20), tmp_path / "model.onnx", 0.0
+    valid, generator, path, worst_s = model_file.read_bytes(), random.Random(20), tmp_path / "model.onnx", 0.0
     tries = 2000 if full else 200
     with EmulatedBoard() as board:
         for _ in range(tries):
-            spoilt.write_bytes(damaged(sound, generator))
-            said, took_s = refusal(spoilt, board.port, tmp_path / "runs")
-            assert str(spoilt) in said
+            path.write_bytes(corrupted(valid, generator))
+            said, took_s = refusal(path, board.port, tmp_path / "runs")
+            assert str(path) in said
             assert "\n" not in said
             worst_s = max(worst_s, took_s)
         assert untouched(board)
@@ -82,12 +82,12 @@ def processor_s():
 
 
 def test_row_20_damaged_model_file_from_the_command_line(matrix_row, full, model_file, tmp_path):
-    sound, generator, spoilt, worst_s = model_file.read_bytes(), random.Random(21), tmp_path / "model.onnx", 0.0
+    valid, generator, path, worst_s = model_file.read_bytes(), random.Random(21), tmp_path / "model.onnx", 0.0
     tries = 50 if full else 4
     with EmulatedBoard() as board:
-        command = [SCRIPT, "--yes", "--robot", "pneumatic-3", "--model", spoilt, "--port", board.port]
+        command = [SCRIPT, "--yes", "--robot", "pneumatic-3", "--model", path, "--port", board.port]
         for _ in range(tries):
-            spoilt.write_bytes(damaged(sound, generator))
+            path.write_bytes(corrupted(valid, generator))
             began_s = processor_s()
             done = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=30)
             worst_s = max(worst_s, processor_s() - began_s)  # it waits for nothing, and others may be busy here
@@ -125,7 +125,7 @@ def test_row_21_model_of_another_robot(matrix_row, make_checkpoint, model_file, 
 
     with EmulatedBoard() as board:
         for name, (change, found, expected) in OTHERS.items():
-            model = redescribed(model_file, tmp_path / "model.onnx", change)
+            model = with_description_changed(model_file, tmp_path / "model.onnx", change)
             said, _ = refusal(model, board.port, tmp_path / "runs")
             assert found in said, name
             assert expected in said, name
@@ -173,7 +173,7 @@ def test_row_22_model_gives_nan_on_the_board(matrix_row, full, model_file, tmp_p
     def attempt(number):
         folder = Path(tmp_path / str(number))
         folder.mkdir(exist_ok=True)
-        model = running_wild(model_file, folder / "model.onnx", values[number], beyond=0.2)
+        model = with_fault_above(model_file, folder / "model.onnx", values[number], threshold=0.2)
         with Stand() as stand, Run(stand, model, folder) as run:
             assert run.left()[0] == 65, run.said
             assert "the actuation is not finite" in run.said or "nothing of it was sent" in run.said

@@ -1,4 +1,4 @@
-"""The controller believes no file: damage, another robot, another layout and a wrong answer are refused."""
+"""Model files that are damaged, do not fit the robot, or compute a wrong output are refused."""
 
 import subprocess
 import sys
@@ -6,17 +6,17 @@ import sys
 import numpy as np
 import onnx
 import pytest
-from spoilt_models import onnx_description, redescribed
+from corrupted_models import onnx_description, with_description_changed
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control import features as feature_layout
 from modsoft.runtime.control import model_file as model_files
-from modsoft.runtime.control.model import Model, unit_of
+from modsoft.runtime.control.model import Model, open_unit
 from modsoft.runtime.errors import ModelError
 
 
 @pytest.fixture
-def controller(model_file):
+def model(model_file):
     return Model.load(model_file)
 
 
@@ -24,106 +24,106 @@ def features(modules, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, (modules, 10))
 
 
-def test_any_number_of_modules(controller):
-    assert controller.history == 3
+def test_any_number_of_modules(model):
+    assert model.history == 3
     for modules in (2, 3, 5, 12, 64):
-        actuation = controller.actuate(features(modules))
+        actuation = model.actuate(features(modules))
         assert actuation.shape == (modules, 1)
         assert actuation.dtype == np.float64
-        np.testing.assert_allclose(controller.unit.chain(features(modules)), actuation, atol=1e-6)
+        np.testing.assert_allclose(model.unit.chain(features(modules)), actuation, atol=1e-6)
 
 
-def test_same_features_same_actuation(controller, model_file):
-    first = controller.actuate(features(3))
-    controller.actuate(features(6))  # nothing is remembered from step to step
-    np.testing.assert_array_equal(controller.actuate(features(3)), first)
+def test_same_features_same_actuation(model, model_file):
+    first = model.actuate(features(3))
+    model.actuate(features(6))  # nothing is remembered from step to step
+    np.testing.assert_array_equal(model.actuate(features(3)), first)
     np.testing.assert_array_equal(Model.load(model_file).actuate(features(3)), first)
 
 
-def test_takes_what_the_window_gives(controller):
+def test_model_accepts_the_features_of_the_window(model):
     robot = robots.load("pneumatic-2")
-    controller.check(robot)
-    controller.warm_up(robot.modules)
+    model.check(robot)
+    model.warm_up(robot.modules)
     rest = np.zeros((2, 2))
-    window = feature_layout.Window(controller.history, rest, robot.action_size)
+    window = feature_layout.Window(model.history, rest, robot.action_size)
     for _ in range(4):
         window.observe(rest)
-        action = controller.actuate(window.features(rest + 0.1))
+        action = model.actuate(window.features(rest + 0.1))
         window.applied(action)
     assert action.shape == (2, 1)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
-def test_nothing_is_computed_from_what_is_not_finite(controller, bad):
-    spoilt = features(3)
-    spoilt[1, 4] = bad
+def test_feature_that_is_not_finite_is_an_error(model, bad):
+    values = features(3)
+    values[1, 4] = bad
     with pytest.raises(ModelError, match=r"feature v_y\[t\] of module 2 is not finite"):
-        controller.actuate(spoilt)
+        model.actuate(values)
 
 
-def test_an_actuation_that_is_not_finite_is_an_error(controller, monkeypatch):
-    monkeypatch.setattr(controller.unit, "whole", lambda _: np.full((3, 1), np.nan))
+def test_actuation_that_is_not_finite_is_an_error(model, monkeypatch):
+    monkeypatch.setattr(model.unit, "whole", lambda _: np.full((3, 1), np.nan))
     with pytest.raises(ModelError, match="actuation is not finite"):
-        controller.actuate(features(3))
+        model.actuate(features(3))
 
 
 @pytest.mark.parametrize("shape", [(1, 10), (0, 10), (3, 9), (3, 11), (30,), (1, 3, 10)])
-def test_shapes(controller, shape):
+def test_wrong_shapes_are_refused(model, shape):
     with pytest.raises(ModelError, match=r"expected \(N, 10\) with N >= 2"):
-        controller.actuate(np.zeros(shape))
+        model.actuate(np.zeros(shape))
 
 
-def test_check_names_what_differs(controller):
-    controller.check(robots.load("pneumatic-3"))
+def test_check_names_the_differences(model):
+    model.check(robots.load("pneumatic-3"))
     with pytest.raises(ModelError, match=r"kind pneumatic, state size 2, action size 1, .*cable-4 has kind cable"):
-        controller.check(robots.load("cable-4"))
+        model.check(robots.load("cable-4"))
     text = robots.text_of("pneumatic-3")
     slow = robots.parse(text.replace("hz = 2.5", "hz = 2.0"))
     assert slow.loop.period_s == 0.5
     with pytest.raises(ModelError, match=r"trained for period_s 0\.4; robot pneumatic-3 has period_s 0\.5"):
-        controller.check(slow)
+        model.check(slow)
 
 
-def test_every_bit_of_the_description_and_the_seal_counts(model_file, tmp_path):
-    """The seal's own digits and the key before them are no way round it."""
-    sound = model_file.read_bytes()
-    start = sound.index(b'"file_sha256"')
-    spoilt = tmp_path / "model.onnx"
+def test_checksum_covers_its_own_field(model_file, tmp_path):
+    """A changed bit in the checksum, or in the key before it, is detected."""
+    valid = model_file.read_bytes()
+    start = valid.index(b'"file_sha256"')
+    path = tmp_path / "model.onnx"
     for at in range(start, start + 82):
         for bit in range(8):
-            content = bytearray(sound)
+            content = bytearray(valid)
             content[at] ^= 1 << bit
-            spoilt.write_bytes(content)
-            with pytest.raises(ModelError, match="seal"):
-                model_files.read(spoilt)
+            path.write_bytes(content)
+            with pytest.raises(ModelError, match="checksum"):
+                model_files.read(path)
 
 
-def test_two_seals_are_none(model_file, tmp_path):
+def test_two_checksums_are_refused(model_file, tmp_path):
     (tmp_path / "model.onnx").write_bytes(model_file.read_bytes() * 2)
-    with pytest.raises(ModelError, match="no seal"):
+    with pytest.raises(ModelError, match="no checksum"):
         Model.load(tmp_path / "model.onnx")
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "no seal"),
+        (b"", "no checksum"),
         (b"PK\x03\x04 and so on", "run modsoft-export on it"),
-        (b"name = 'robot'\n", "no seal"),
+        (b"name = 'robot'\n", "no checksum"),
         (
-            model_files.with_checksum(b'junk "file_sha256":"%s"' % model_files.UNSEALED.encode()),
+            model_files.with_checksum(b'junk "file_sha256":"%s"' % model_files.CHECKSUM_PLACEHOLDER.encode()),
             "onnxruntime .* refuses it",
         ),
     ],
 )
-def test_other_files(tmp_path, content, message):
+def test_other_files_are_refused(tmp_path, content, message):
     (tmp_path / "model.onnx").write_bytes(content)
     with pytest.raises(ModelError, match=message) as refused:
         Model.load(tmp_path / "model.onnx")
     assert "\n" not in str(refused.value)
 
 
-def test_no_file(tmp_path):
+def test_missing_file_is_an_error(tmp_path):
     for path, message in ((tmp_path / "model.onnx", "no model file"), (tmp_path, "found a folder")):
         with pytest.raises(ModelError, match=message):
             Model.load(path)
@@ -137,7 +137,7 @@ def test_no_file(tmp_path):
         (lambda t: t.pop("features"), "features"),
         (lambda t: t.update(kind="wheeled"), "kind 'wheeled'"),
         (lambda t: t.update(kind="cable"), "state size 2, expected 3"),
-        (lambda t: t.update(label="the other way round"), "label"),
+        (lambda t: t.update(label="tip first"), "label"),
         (lambda t: t.update(opset=17), "opset 17, expected 18"),
         (lambda t: t["features"].reverse(), "features"),
         (lambda t: t["features"].pop(), "features of the graph 10, expected 9"),
@@ -150,16 +150,16 @@ def test_no_file(tmp_path):
         (lambda t: t["golden"][0]["features"][0].__setitem__(0, None), "golden"),
     ],
 )
-def test_a_description_that_does_not_hold(model_file, tmp_path, change, message):
+def test_wrong_description_is_refused(model_file, tmp_path, change, message):
     with pytest.raises(ModelError, match=message):
-        Model.load(redescribed(model_file, tmp_path / "model.onnx", change))
+        Model.load(with_description_changed(model_file, tmp_path / "model.onnx", change))
 
 
-def test_a_sound_copy_loads(model_file, tmp_path):
-    Model.load(redescribed(model_file, tmp_path / "model.onnx", lambda table: None))
+def test_valid_copy_is_loaded(model_file, tmp_path):
+    Model.load(with_description_changed(model_file, tmp_path / "model.onnx", lambda table: None))
 
 
-def test_golden_pairs_find_other_weights_under_a_good_seal(model_file, tmp_path):
+def test_golden_pairs_detect_changed_weights_with_a_valid_checksum(model_file, tmp_path):
     def nudge(model):
         tensor = next(t for t in model.graph.initializer if t.name == "layer_1_W")
         array = onnx.numpy_helper.to_array(tensor) * np.float32(1.01)
@@ -168,20 +168,22 @@ def test_golden_pairs_find_other_weights_under_a_good_seal(model_file, tmp_path)
     model = onnx.load(model_file)
     nudge(model)
     table = onnx_description(model)
-    content = model.SerializeToString().replace(table["file_sha256"].encode(), model_files.UNSEALED.encode())
+    content = model.SerializeToString().replace(
+        table["file_sha256"].encode(), model_files.CHECKSUM_PLACEHOLDER.encode()
+    )
     (tmp_path / "model.onnx").write_bytes(model_files.with_checksum(content))
     with pytest.raises(ModelError, match="golden pair"):
         Model.load(tmp_path / "model.onnx")
 
 
-def test_another_border_is_refused(model_file):
+def test_graph_with_another_interface_is_refused(model_file):
     model = onnx.load(model_file)
     model.graph.output.pop()
     with pytest.raises(ModelError, match="inputs, states, outputs"):
-        unit_of(model.SerializeToString())
+        open_unit(model.SerializeToString())
 
 
-def test_needs_no_torch_and_no_onnx(model_file):
+def test_loading_imports_neither_torch_nor_onnx(model_file):
     script = (
         "import sys\n"
         "from modsoft.runtime.control.model import Model\n"

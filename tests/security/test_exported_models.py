@@ -1,12 +1,12 @@
-"""An ONNX model from a stranger reads nothing but itself, and is refused in one line."""
+"""An untrusted ONNX model reads no other file, and is refused in one line."""
 
 import os
 
 import numpy as np
 import onnx
 import pytest
+from corrupted_models import onnx_description, write_model
 from onnx import TensorProto, helper
-from spoilt_models import onnx_description, sealed_at
 
 from modsoft.export import cli as export_cli
 from modsoft.export import inspect
@@ -21,8 +21,8 @@ def largest_weight(model):
     return max(model.graph.initializer, key=lambda tensor: len(tensor.raw_data))
 
 
-def outside(tensor, location):
-    """Puts the tensor's numbers into the file `location`, where the harm of reading it is that the model works."""
+def make_external(tensor, location):
+    """Moves the tensor's values into the file `location`; the model works if that file is read."""
     with open(os.path.basename(location), "wb") as file:
         file.write(tensor.raw_data)
     tensor.ClearField("raw_data")
@@ -31,15 +31,15 @@ def outside(tensor, location):
         tensor.external_data.add(key=key, value=value)
 
 
-def in_a_branch(model):
-    """Moves the largest weight into both branches of an If, and gives it there: onnxruntime reads files for these with
-    no word of where they may be."""
+def move_into_branch(model):
+    """Moves the largest weight into both branches of an If, where onnxruntime does not restrict the location of
+    external data. Returns the tensors of the branches."""
     weight, graph = largest_weight(model), model.graph
     inner = TensorProto()
     inner.CopyFrom(weight)
     inner.name = "inner"
-    out = helper.make_tensor_value_info("given", TensorProto.FLOAT, list(weight.dims))
-    branch = helper.make_graph([helper.make_node("Identity", ["inner"], ["given"])], "branch", [], [out], [inner])
+    out = helper.make_tensor_value_info("value", TensorProto.FLOAT, list(weight.dims))
+    branch = helper.make_graph([helper.make_node("Identity", ["inner"], ["value"])], "branch", [], [out], [inner])
     node = helper.make_node("If", ["always"], [weight.name], then_branch=branch, else_branch=branch)
     graph.initializer.remove(weight)
     graph.initializer.append(helper.make_tensor("always", TensorProto.BOOL, [], [True]))
@@ -51,15 +51,15 @@ def in_a_branch(model):
 
 @pytest.mark.parametrize("place", ["initializer", "branch"])
 @pytest.mark.parametrize("location", ["weights.bin", "./weights.bin", "{folder}/weights.bin", "../{name}/weights.bin"])
-def test_a_model_with_weights_in_another_file(tmp_path, monkeypatch, model_file, place, location, refused):
+def test_weights_in_another_file_are_refused(tmp_path, monkeypatch, model_file, place, location, refused):
     monkeypatch.chdir(tmp_path)
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
-    tensors = in_a_branch(model) if place == "branch" else [largest_weight(model)]
-    sealed_at(path, model, onnx_description(model))
-    Model.load(path)  # so far it is only an odd model
+    tensors = move_into_branch(model) if place == "branch" else [largest_weight(model)]
+    write_model(path, model, onnx_description(model))
+    Model.load(path)  # valid so far
     for tensor in tensors:
-        outside(tensor, location.format(folder=tmp_path, name=tmp_path.name))
-    sealed_at(path, model, onnx_description(model))
+        make_external(tensor, location.format(folder=tmp_path, name=tmp_path.name))
+    write_model(path, model, onnx_description(model))
     refused(Model.load, path, "onnxruntime .* refuses it")
 
 
@@ -71,23 +71,22 @@ def test_a_model_with_weights_in_another_file(tmp_path, monkeypatch, model_file,
         (hil_cli.main, ["--robot", "pneumatic-3", "--task", "down", "--model"], ["--report", "out"]),
     ],
 )
-def test_the_commands_end_with_65(tmp_path, monkeypatch, model_file, main, before, after, ended):
+def test_commands_exit_with_65(tmp_path, monkeypatch, model_file, main, before, after, ended):
     monkeypatch.chdir(tmp_path)
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
-    outside(largest_weight(model), "/etc/hostname")
-    sealed_at(path, model, onnx_description(model))
-    before_it = set(tmp_path.iterdir())
-    code, said = ended(main, *before, path, *after)
-    assert (code, len(said)) == (65, 1), said
-    assert set(tmp_path.iterdir()) == before_it
+    make_external(largest_weight(model), "/etc/hostname")
+    write_model(path, model, onnx_description(model))
+    files_before = set(tmp_path.iterdir())
+    code, lines = ended(main, *before, path, *after)
+    assert (code, len(lines)) == (65, 1), lines
+    assert set(tmp_path.iterdir()) == files_before
 
 
-def test_what_a_model_says_does_not_command_the_terminal(tmp_path, model_file, capfd):
-    """Of all texts, those of the provenance are free."""
+def test_control_characters_in_the_provenance_are_escaped(tmp_path, model_file, capfd):
     clear = "\x1b[2J"
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
-    said = {**onnx_description(model), "provenance": {f"seed{clear}": f"1{clear}"}}
-    sealed_at(path, model, said)
+    description = {**onnx_description(model), "provenance": {f"seed{clear}": f"1{clear}"}}
+    write_model(path, model, description)
     inspect.print_model(path)
     out = capfd.readouterr().out
     assert "seed\\x1b[2J: 1\\x1b[2J" in out
@@ -103,42 +102,42 @@ def test_what_a_model_says_does_not_command_the_terminal(tmp_path, model_file, c
     ],
     ids=["deep", "not a text", "no name"],
 )
-def test_a_description_that_breaks_its_reader(tmp_path, model_file, refused, before, after):
+def test_unreadable_description_is_refused(tmp_path, model_file, refused, before, after):
     content = model_file.read_bytes()
     if len(before) == len(after):
         content = content.replace(before, after)
-    else:  # an entry of the metadata, in which lengths have to hold
+    else:  # an entry of the metadata, whose length is part of the file
         model = onnx.load(model_file)
-        mark = "@" * (len(after) - len(before))
+        padding = "@" * (len(after) - len(before))
         (entry,) = model.metadata_props
-        entry.value = entry.value.replace(before.decode(), before.decode() + mark)
-        content = model.SerializeToString().replace(before + mark.encode(), after)
-    seal = model_files._SEAL.search(content)[1]
+        entry.value = entry.value.replace(before.decode(), before.decode() + padding)
+        content = model.SerializeToString().replace(before + padding.encode(), after)
+    checksum = model_files._CHECKSUM_FIELD.search(content)[1]
     (tmp_path / "model.onnx").write_bytes(
-        model_files.with_checksum(content.replace(seal, model_files.UNSEALED.encode()))
+        model_files.with_checksum(content.replace(checksum, model_files.CHECKSUM_PLACEHOLDER.encode()))
     )
     refused(Model.load, tmp_path / "model.onnx", "UTF-8|description cannot be read|refuses it")
 
 
-def test_a_model_with_weights_at_an_address_of_the_memory(tmp_path, monkeypatch, model_file, refused):
+def test_weights_at_a_memory_address_are_refused(tmp_path, monkeypatch, model_file, refused):
     monkeypatch.chdir(tmp_path)
     model, path = onnx.load(model_file), tmp_path / "model.onnx"
     tensor = largest_weight(model)
-    numbers = np.frombuffer(tensor.raw_data, dtype=np.uint8).copy()
-    outside(tensor, "weights.bin")
-    tensor.external_data[0].value, tensor.external_data[1].value = "*/_ORT_MEM_ADDR_/*", str(numbers.ctypes.data)
-    sealed_at(path, model, onnx_description(model))
+    values = np.frombuffer(tensor.raw_data, dtype=np.uint8).copy()
+    make_external(tensor, "weights.bin")
+    tensor.external_data[0].value, tensor.external_data[1].value = "*/_ORT_MEM_ADDR_/*", str(values.ctypes.data)
+    write_model(path, model, onnx_description(model))
     refused(Model.load, path, "onnxruntime .* refuses it")
 
 
-def test_a_model_in_the_other_format_of_onnxruntime(tmp_path, model_file, refused):
+def test_ort_format_is_refused(tmp_path, model_file, refused):
     options, path = onnxruntime.SessionOptions(), tmp_path / "model.ort"
     options.optimized_model_filepath = str(path)
     options.add_session_config_entry("session.save_model_format", "ORT")
     options.log_severity_level = 4
     onnxruntime.InferenceSession(model_file, options)
     content = path.read_bytes()
-    onnxruntime.InferenceSession(content)  # whoever does not say which format takes both
-    seal = model_files._SEAL.search(content)[1]
-    path.write_bytes(model_files.with_checksum(content.replace(seal, model_files.UNSEALED.encode())))
+    onnxruntime.InferenceSession(content)  # accepted while the format is not restricted
+    checksum = model_files._CHECKSUM_FIELD.search(content)[1]
+    path.write_bytes(model_files.with_checksum(content.replace(checksum, model_files.CHECKSUM_PLACEHOLDER.encode())))
     refused(Model.load, path, "onnxruntime .* refuses it")

@@ -1,4 +1,4 @@
-"""Model files that are damaged, that describe themselves wrongly, or that answer what no model should."""
+"""Model files with damaged bytes, with an altered description, or with invalid outputs."""
 
 import numpy as np
 import onnx
@@ -7,23 +7,23 @@ from onnx import helper, numpy_helper
 from modsoft.runtime.control import model_file as model_files
 
 
-def damaged(sound, generator):
-    """Bytes that differ from `sound`, in some way in which a file may be spoilt on a disk or in a transfer."""
+def corrupted(valid, generator):
+    """`valid` with a random error of a disk or of a transfer."""
     while True:
-        content = bytearray(sound)
+        content = bytearray(valid)
         at = generator.randrange(len(content))
         match generator.randrange(5):
             case 0:  # one bit
                 content[at] ^= 1 << generator.randrange(8)
-            case 1:  # a lost sector
+            case 1:  # a sector of zeros
                 content[at : at + 512] = bytes(len(content[at : at + 512]))
-            case 2:  # cut short
+            case 2:  # truncated
                 del content[at:]
-            case 3:  # something behind
+            case 3:  # trailing bytes
                 content += bytes([generator.randrange(256)]) * generator.randrange(1, 600)
-            case 4:  # a byte lost
+            case 4:  # a missing byte
                 del content[at]
-        if content != sound:  # zeros over zeros, for instance
+        if content != valid:  # zeros may replace zeros
             return bytes(content)
 
 
@@ -31,34 +31,34 @@ def onnx_description(model):
     return model_files.msgspec.json.decode(model.metadata_props[0].value)
 
 
-def redescribed(model_file, path, change):
-    """A copy of the model at `path` whose description went through change(table), soundly sealed."""
+def with_description_changed(model_file, path, change):
+    """Writes a copy of the model to `path`, its description altered by change(table), its checksum valid."""
     model = onnx.load(model_file)
     change(table := onnx_description(model))
-    return sealed_at(path, model, table)
+    return write_model(path, model, table)
 
 
-def sealed_at(path, model, table):
-    """Writes a model with this description, soundly sealed; returns `path`."""
-    table["file_sha256"] = model_files.UNSEALED
+def write_model(path, model, table):
+    """Writes a model with this description and a valid checksum; returns `path`."""
+    table["file_sha256"] = model_files.CHECKSUM_PLACEHOLDER
     del model.metadata_props[:]
     helper.set_model_props(model, {model_files.METADATA_KEY: model_files.msgspec.json.encode(table).decode()})
     path.write_bytes(model_files.with_checksum(model.SerializeToString()))
     return path
 
 
-def running_wild(model_file, path, value, beyond):
-    """A copy of the model at `path` that passes every check before a run, and answers `value` on three modules as soon
-    as some feature but the label lies beyond `beyond`; the pairs that are replayed are of two and six modules."""
+def with_fault_above(model_file, path, value, threshold):
+    """Writes a copy of the model to `path` that passes every check at start, and whose output for three modules is
+    `value` while any feature except the label exceeds `threshold`. (The golden pairs have two and four modules.)"""
     model = onnx.load(model_file)
     graph = model.graph
     for node in graph.node:
         for index, name in enumerate(node.output):
             if name == model_files.ACTUATION:
-                node.output[index] = "tame"
+                node.output[index] = "regular"
     constants = {
-        "beyond": np.float32(beyond),
-        "wild": np.float32(value),
+        "threshold": np.float32(threshold),
+        "fault": np.float32(value),
         "three": np.int64([3]),
         "one": np.int64([1]),
         "two": np.int64([2]),
@@ -73,9 +73,9 @@ def running_wild(model_file, path, value, beyond):
             helper.make_node("Equal", ["modules", "three"], ["are_three"]),
             helper.make_node("Slice", [model_files.FEATURES, "zero", "last", "two"], ["unlabelled"]),
             helper.make_node("ReduceMax", ["unlabelled"], ["largest"], keepdims=0),
-            helper.make_node("Greater", ["largest", "beyond"], ["is_beyond"]),
-            helper.make_node("And", ["are_three", "is_beyond"], ["is_wild"]),
-            helper.make_node("Where", ["is_wild", "wild", "tame"], [model_files.ACTUATION]),
+            helper.make_node("Greater", ["largest", "threshold"], ["is_above"]),
+            helper.make_node("And", ["are_three", "is_above"], ["is_fault"]),
+            helper.make_node("Where", ["is_fault", "fault", "regular"], [model_files.ACTUATION]),
         ]
     )
-    return sealed_at(path, model, onnx_description(model))
+    return write_model(path, model, onnx_description(model))
