@@ -1,4 +1,4 @@
-"""One study in miniature for all tests of this part, made by the command that a user would type."""
+"""One miniature study for all tests of this part, made by the command."""
 
 import os
 import shutil
@@ -30,7 +30,7 @@ def evaluate():
 
 @pytest.fixture(scope="session")
 def ended(evaluate):
-    """ended(*arguments) waits for modsoft-evaluate; gives exit code, standard output and error."""
+    """ended(*arguments) runs modsoft-evaluate and returns exit code, standard output and error."""
 
     def run(*arguments):
         process = evaluate(*arguments)
@@ -41,16 +41,16 @@ def ended(evaluate):
 
 
 @pytest.fixture(scope="session")
-def made_study(tmp_path_factory, ended):
-    """The whole study in short form. Not to be changed."""
-    folder = tmp_path_factory.mktemp("made") / "study"
+def shared_study(tmp_path_factory, ended):
+    """The folder of a miniature study. Tests do not change it."""
+    folder = tmp_path_factory.mktemp("shared") / "study"
     code, _, error = ended("study", "--quick", "--jobs", "1", "--out", folder)
     assert code == 0, error
     return folder
 
 
 @pytest.fixture
-def study(made_study, tmp_path):
-    """A copy of it, to damage."""
-    shutil.copytree(made_study, tmp_path / "study")
+def study(shared_study, tmp_path):
+    """A copy of the miniature study that tests may change."""
+    shutil.copytree(shared_study, tmp_path / "study")
     return tmp_path / "study"

@@ -1,4 +1,4 @@
-"""What a cell of the report's tables is made of: records picked by their keys, seeds put together, marks."""
+"""Cells of the report's tables: records selected by their fields, combined over the seeds, and their targets."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from modsoft.study.measurements import Record
+from modsoft.study.results import Record
 
-ALONE_SHARE = 0.5  # of the paper's error: the mark of the network alone
-CORRECTED_SHARE, OVER_FLOOR = 0.1, 1.1  # of the paper's, or over the floor where that is higher: with correction
+NETWORK_TARGET = 0.5  # of the paper's error: target of the network alone
+CORRECTED_TARGET, ORACLE_TARGET = 0.1, 1.1  # of the paper's and of the oracle error: target with correction, the larger
 
 
 class Cell(NamedTuple):
-    """One error over the seeds: their mean, the smallest and the largest, and the mean of what it spreads by itself."""
+    """One error over the seeds: mean, smallest and largest mean of a seed, and mean of the seeds' deviations."""
 
     mean: float
     least: float
@@ -23,45 +23,45 @@ class Cell(NamedTuple):
     seeds: int
 
     def __str__(self) -> str:
-        own = "" if self.std is None else f" ± {self.std:.2f}"
-        over = f" ({self.least:.2f} to {self.most:.2f})" if self.seeds > 1 else ""
-        return f"{self.mean:.2f}{own}{over}"
+        deviation = "" if self.std is None else f" ± {self.std:.2f}"
+        spread = f" ({self.least:.2f} to {self.most:.2f})" if self.seeds > 1 else ""
+        return f"{self.mean:.2f}{deviation}{spread}"
 
 
-def pick(records: Sequence[Record], **where: Any) -> list[Record]:
-    """The records that have all these values."""
-    return [record for record in records if all(record[key] == value for key, value in where.items())]
+def pick(records: Sequence[Record], **fields: Any) -> list[Record]:
+    """The records whose fields have all these values."""
+    return [each for each in records if all(getattr(each, name) == value for name, value in fields.items())]
 
 
-def cell(records: Sequence[Record], **where: Any) -> Cell | None:
-    """The one cell of these keys, over whatever seeds there are; None where there is nothing.
+def cell(records: Sequence[Record], **fields: Any) -> Cell | None:
+    """The cell of the records with these fields, over all their seeds; None if there are no such records.
 
-    ValueError where the keys leave two numbers of one seed: a table would otherwise mix what does not belong together.
+    Raises ValueError if two records have the same seed: they belong to different cells.
     """
-    found = pick(records, **where)
-    if not found:
+    selected = pick(records, **fields)
+    if not selected:
         return None
-    if len({record["seed"] for record in found}) != len(found):
-        raise ValueError(f"{len(found)} records for {where}, expected one a seed")
-    means = [record["mean"] for record in found]
-    stds = [record["std"] for record in found if record["std"] is not None]
-    return Cell(float(np.mean(means)), min(means), max(means), float(np.mean(stds)) if stds else None, len(found))
+    if len({each.seed for each in selected}) != len(selected):
+        raise ValueError(f"{len(selected)} records for {fields}, expected one for each seed")
+    means = [each.mean for each in selected]
+    stds = [each.std for each in selected if each.std is not None]
+    return Cell(float(np.mean(means)), min(means), max(means), float(np.mean(stds)) if stds else None, len(selected))
 
 
 def ratio(ours: Cell | None, theirs: Cell | None) -> str:
-    """Ours over the paper's."""
+    """Our error over the paper's; empty if one is missing."""
     return f"{ours.mean / theirs.mean:.2f}" if ours and theirs else ""
 
 
-def mark(paper: Cell, floor: Cell | None, corrected: bool) -> float:
-    """The largest mean that meets the mark of a cell, in the paper's unit."""
+def target(paper: Cell, oracle: Cell | None, corrected: bool) -> float:
+    """The largest mean error that meets the target of a cell, in the paper's unit."""
     if not corrected:
-        return ALONE_SHARE * paper.mean
-    return max(CORRECTED_SHARE * paper.mean, OVER_FLOOR * floor.mean if floor else 0.0)
+        return NETWORK_TARGET * paper.mean
+    return max(CORRECTED_TARGET * paper.mean, ORACLE_TARGET * oracle.mean if oracle else 0.0)
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
-    """Lines of a table in Markdown: the first column to the left, the others to the right."""
+    """Lines of a Markdown table: the first column aligned left, the others right."""
     lines = ["| " + " | ".join(heads) + " |", "| --- |" + " ---: |" * (len(heads) - 1)]
-    shown = [["" if value is None else str(value) for value in row] for row in rows]
-    return [*lines, *("| " + " | ".join(row) + " |" for row in shown), ""]
+    texts = [["" if value is None else str(value) for value in row] for row in rows]
+    return [*lines, *("| " + " | ".join(row) + " |" for row in texts), ""]

@@ -1,4 +1,4 @@
-"""The floor of every cell: the smallest error that any sequence of actions is known to reach, found on the plant."""
+"""The stage that finds the oracle errors: the smallest errors that any sequence of actions is known to reach."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from modsoft.runtime.arrays import Array
 from modsoft.study import rollouts
 from modsoft.study.paths import Folder
 from modsoft.study.plan import Plan
-from modsoft.study.scheduler import Stage, Told
+from modsoft.study.scheduler import AddProgress, Stage
 from modsoft.training import made_from
 from modsoft.training.simulation.fleet import simulated
 from modsoft.training.simulation.rollout import Rollout, rollout
 
-STEP_S = 0.35  # of one core, for a control step of four modules, about
+STEP_S = 0.35  # estimate for a control step of four modules on one core
 
 
-def finding(plan: Plan, folder: Folder, jobs: int) -> Stage:
-    """floors/*.npz, each a run like any other: what the robot does under the best actions found."""
+def oracle_stage(plan: Plan, folder: Folder, jobs: int) -> Stage:
+    """oracle/*.npz, each stored as a run: the robot's motion under the best actions found."""
     missing = [
-        each for each in plan.oracle_errors if rollouts.meta(folder.oracle_error(*each)) != identity(plan, *each)
+        each
+        for each in plan.oracle_errors
+        if rollouts.stored_identity(folder.oracle_error(*each)) != identity(plan, *each)
     ]
-    return Stage("oracle", missing, partial(_find, plan, folder), partial(find_s, plan))
+    return Stage("oracle", missing, partial(_optimize, plan, folder), partial(oracle_s, plan))
 
 
-def find_s(plan: Plan, each: tuple[str, int]) -> float:
-    return (plan.steps or 250) * STEP_S * (each[1] / 4) ** 2
+def oracle_s(plan: Plan, task_and_modules: tuple[str, int]) -> float:
+    return (plan.steps or 250) * STEP_S * (task_and_modules[1] / 4) ** 2
 
 
 @functools.cache
@@ -37,19 +39,20 @@ def code_sha256() -> str:
 
 
 def identity(plan: Plan, task: str, modules: int) -> dict[str, Any]:
+    """What the stored run depends on."""
     steps = len(rollouts.desired_of(plan, task, modules))
     return {"task": task, "modules": modules, "steps": steps, "seed": 0, "code_sha256": code_sha256()}
 
 
-def _find(plan: Plan, folder: Folder, each: tuple[str, int], told: Told) -> None:
+def _optimize(plan: Plan, folder: Folder, task_and_modules: tuple[str, int], add_progress: AddProgress) -> None:
     from modsoft.training.simulation.oracle import oracle_error
 
-    task, modules = each
+    task, modules = task_and_modules
     desired = rollouts.desired_of(plan, task, modules)
     actions, _ = oracle_error("cable", modules, desired, seed=0)
-    rollouts.keep(folder.oracle_error(*each), identity(plan, *each), replay(modules, actions), desired)
+    rollouts.store(folder.oracle_error(task, modules), identity(plan, task, modules), replay(modules, actions), desired)
 
 
 def replay(modules: int, actions: Array) -> Rollout:
-    """What a robot at rest does under actions (K, N, A)."""
+    """The motion of a robot, at rest before, under actions (K, N, A)."""
     return rollout(simulated("cable", modules, 1), actions[:, None]).robots()[0]

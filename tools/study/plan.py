@@ -1,4 +1,4 @@
-"""What the study consists of: data, models, closed-loop runs, oracle errors. Pure values."""
+"""What the study consists of: data sets, models, closed-loop runs, oracle errors. Values only."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from modsoft.runtime.choices import CORRECTIONS
 
 TASKS = ("A", "B", "C")
 SPLITS = ("blocks", "shuffled")
-# What the robot or its tracker suffers; `disturb.py` does it.
-DISTURBANCES = ("noise", "lost", "stiffness", "payload")
-MAIN = ("bilstm", "rich")  # network and data that the marks are set for
+PERTURBATIONS = ("noise", "frame-loss", "stiffness", "payload")  # of tracker and robot, see `perturbations.py`
+MAIN = ("bilstm", "rich")  # network and data that the targets are set for
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class Data:
 
 @dataclass(frozen=True)
 class Model:
-    """A network to train. data: the name of a mix of data sets, see `Plan.mixes`."""
+    """A network to train. data: name of a mix of data sets, see `Plan.mixes`."""
 
     network: str
     data: str
@@ -42,22 +41,22 @@ class Model:
 
 @dataclass(frozen=True)
 class Run:
-    """A model in closed loop on a robot of `modules` modules."""
+    """A closed-loop run of a model on a robot of `modules` modules."""
 
     model: Model
     task: str
     modules: int
     correction: str
-    disturbance: str = "none"
+    perturbation: str = "none"
 
     @property
     def name(self) -> str:
-        return f"{self.model.name}.{self.task}{self.modules}.{self.correction}.{self.disturbance}"
+        return f"{self.model.name}.{self.task}{self.modules}.{self.correction}.{self.perturbation}"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """data: to collect; mixes: which of them a model is trained on, by the name that `Model.data` has."""
+    """data: data sets to collect; mixes: names of the data sets of each mix that models are trained on."""
 
     data: tuple[Data, ...]
     mixes: dict[str, tuple[str, ...]]
@@ -65,7 +64,7 @@ class Plan:
     runs: tuple[Run, ...]
     oracle_errors: tuple[tuple[str, int], ...]  # task, modules
     settings: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)  # of training, by network and mix
-    steps: int | None = None  # of each task; all by default
+    steps: int | None = None  # of each task; None: all
 
     @property
     def seeds(self) -> list[int]:
@@ -73,32 +72,32 @@ class Plan:
 
 
 def models(seeds: tuple[int, ...]) -> tuple[Model, ...]:
-    """All three networks on the paper's data in both splits; the biLSTM on the rich data, honestly split."""
-    wanted = [(*MAIN, "blocks")]  # first, since it takes the longest
-    wanted += [(network, "paper", split) for network in ("module-lstm", "lstm", "bilstm") for split in SPLITS]
-    return tuple(Model(*each, seed) for each in wanted for seed in seeds)
+    """All three networks on the paper's data in both splits; the biLSTM on the rich data, split in blocks."""
+    kinds = [(*MAIN, "blocks")]  # first, since it takes the longest
+    kinds += [(network, "paper", split) for network in ("module-lstm", "lstm", "bilstm") for split in SPLITS]
+    return tuple(Model(*kind, seed) for kind in kinds for seed in seeds)
 
 
-def runs(of: tuple[Model, ...], numbers: tuple[int, ...]) -> tuple[Run, ...]:
-    """Tables 2 and 3, the other module `numbers`, and the disturbances, by the models of the honest split."""
-    flown = [model for model in of if model.split == "blocks" and model.network != "module-lstm"]
-    wanted = []
-    for model in flown:
+def runs(trained: tuple[Model, ...], numbers: tuple[int, ...]) -> tuple[Run, ...]:
+    """Tables 2 and 3, the other module `numbers` and the perturbations, by the models split in blocks."""
+    controllers = [model for model in trained if model.split == "blocks" and model.network != "module-lstm"]
+    chosen = []
+    for model in controllers:
         main = (model.network, model.data) == MAIN
         modules = [4] + ([6] if model.network == "bilstm" else []) + (list(numbers) if main else [])
         for correction in CORRECTIONS:
             for task in TASKS:
-                wanted += [Run(model, task, each, correction) for each in modules]
+                chosen += [Run(model, task, each, correction) for each in modules]
                 if main:
-                    wanted += [Run(model, task, each, correction, what) for each in (4, 6) for what in DISTURBANCES]
-    return tuple(wanted)
+                    chosen += [Run(model, task, each, correction, how) for each in (4, 6) for how in PERTURBATIONS]
+    return tuple(chosen)
 
 
-# As many samples as the paper's, collected its two ways.
+# As many samples as the paper's, collected in its two ways.
 PAPER = Data("paper", samples=16_000, strategy="staged", seed=0, steps=1000)
 TRADITIONAL = Data("traditional", samples=16_000, strategy="random", seed=0, steps=1000)
-# What data that cost nothing can be: more of the paper's, motions as smooth as a task's, and the same on robots of
-# other stiffness and payload, so that the network learns to see in the history what it drives.
+# More data of the paper's strategy, motions as smooth as a task's, and such motions of robots of other stiffness and
+# payload, from which the network learns to infer the robot's properties from the history.
 RICH = (
     Data("staged", samples=96_000, strategy="staged", seed=1, steps=300),
     Data("smooth", samples=96_000, strategy="smooth", seed=2, steps=300),
@@ -108,12 +107,12 @@ RICH = (
 
 def full() -> Plan:
     """The study as it is reported."""
-    made = models(seeds=(0, 1, 2))
+    trained = models(seeds=(0, 1, 2))
     return Plan(
         data=(PAPER, TRADITIONAL, *RICH),
         mixes={"paper": (PAPER.name,), "rich": tuple(each.name for each in RICH)},
-        models=made,
-        runs=runs(made, numbers=(2, 3, 5, 8, 12)),
+        models=trained,
+        runs=runs(trained, numbers=(2, 3, 5, 8, 12)),
         oracle_errors=tuple((task, modules) for modules in (4, 6) for task in TASKS),
         settings={
             ("module-lstm", "paper"): {"batch": 128, "iterations": 1500},
@@ -125,16 +124,16 @@ def full() -> Plan:
 
 
 def quick() -> Plan:
-    """The same in miniature, to see that it works: its numbers say nothing."""
-    made = models(seeds=(0,))
+    """A miniature of the study that tests the command; its numbers have no meaning."""
+    trained = models(seeds=(0,))
     sets = tuple(Data(each.name, 8 * 60, each.strategy, each.seed, steps=60) for each in (PAPER, TRADITIONAL, *RICH))
     small = {"batch": 32, "iterations": 60, "layers": 2, "hidden": 16}
     return Plan(
         data=sets,
         mixes={"paper": (PAPER.name,), "rich": tuple(each.name for each in RICH)},
-        models=made,
-        runs=runs(made, numbers=(3,)),
+        models=trained,
+        runs=runs(trained, numbers=(3,)),
         oracle_errors=(("A", 4),),
-        settings={(model.network, model.data): small for model in made},
+        settings={(model.network, model.data): small for model in trained},
         steps=12,
     )

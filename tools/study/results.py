@@ -1,71 +1,110 @@
-"""The types of results.json, by which it is checked when it is read."""
+"""results.json: every number of the report as a flat list of typed records, with its one reader and writer."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any, Literal
+
 import msgspec
 
+from modsoft.runtime.errors import ModelError
+from modsoft.runtime.files import read_text
 
-class Record(msgspec.Struct, forbid_unknown_fields=True):
-    """One number of the report, with all that says what it is of; null for what does not apply."""
+ESTIMATION = "actuation estimation error"
+CONTROL = "configuration error"
+TIP_DISTANCE = "distance of the tip from the axis"
+TIP_TILT = "tilt of the tip"
+COVERED = "volume covered by the module's end"
+UNITS = {
+    ESTIMATION: "% of the actuation range",
+    CONTROL: "% of the unit vector's length",
+    TIP_DISTANCE: "% of the robot's length",
+    TIP_TILT: "degrees",
+    COVERED: "cm³",
+}
+CONTROL_TABLES = {4: "2", 6: "3"}  # the paper's, by the number of modules
 
-    table: str  # 1, 2, 3, modules, robustness, end, coverage
-    quantity: str  # what mean and std are of, with its unit
-    source: str
-    network: str | None
-    data: str | None
-    split: str | None
-    seed: int | None
-    task: str | None
-    modules: int | None
-    correction: str | None
-    disturbance: str | None
-    skip_first: int | None  # steps at the start of the task that are left out
-    module: int | None  # 1 at the base
+
+class Record(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
+    """One number of the report; None in a field that does not apply.
+
+    `mean` and `std` are over the control steps of a task or the windows of a test part, for one module and one seed.
+    """
+
+    table: Literal["1", "2", "3", "modules", "robustness", "end-effector", "coverage"]  # 1 to 3: as in the paper
+    quantity: str  # what mean and std are of, a key of UNITS
+    unit: str  # of mean and std
+    source: Literal["study", "paper", "oracle"]  # oracle: the smallest error found by optimising the actions
+    network: str | None = None  # bilstm, lstm, module-lstm (one LSTM for each module)
+    data: str | None = None  # the mix of data sets that the network was trained on; in coverage the data set
+    split: str | None = None  # of the windows into training and test part: blocks, shuffled
+    seed: int | None = None  # of the training
+    task: str | None = None  # A, B, C
+    modules: int  # of the robot
+    module: int | None = None  # 1 at the base
+    correction: str | None = None  # none, integral
+    perturbation: str | None = None  # none, noise, frame-loss, stiffness, payload
+    skipped_steps: int | None = None  # control steps at the start of the task that mean and std leave out
     mean: float
-    std: float | None
+    std: float | None = None  # standard deviation; None also where the paper gives none
 
 
-KEYS = Record.__struct_fields__
+def record(quantity: str, **fields: Any) -> Record:
+    """A record of a quantity, in its unit."""
+    return Record(quantity=quantity, unit=UNITS[quantity], **fields)
 
 
 class Settings(msgspec.Struct):
-    """What the report shows of a model's settings."""
+    """How a model was trained; the fields are those of `modsoft.training.train.Settings`."""
 
+    network: str
     layers: int
-    hidden: int
-    history: int
-    batch: int
+    hidden: int  # units of a layer
+    history: int  # T, control steps
+    batch: int  # windows of an iteration
     iterations: int
+    learning_rate: float  # peak
+    dropout: float
+    truncation_probability: float
+    split: str
+    seed: int
+    threads: int
+    precision: str
+    minutes: float | None = None  # limit of the training time
 
 
 class Model(msgspec.Struct):
     """A trained model."""
 
-    model: str
+    name: str
     settings: Settings
     samples: int
+    windows: list[int]  # of the training, validation and test part
     iterations_done: int
-    seconds: float
+    seconds: float  # of training, wall clock
+    data_sha256: str
 
 
 class Data(msgspec.Struct):
-    """A data set."""
+    """A collected data set."""
 
     name: str
+    robot: str
     strategy: str
     samples: int
-    steps: int
+    steps: int  # of an episode
     seed: int
 
 
 class About(msgspec.Struct):
-    """What was trained on what, and how long it took."""
+    """What was trained on what."""
 
     code_version: str
     seeds: list[int]
-    steps: int | None
+    steps: int | None  # of each task; None: all
     data: list[Data]
-    mixes: dict[str, list[str]]
+    mixes: dict[str, list[str]]  # data sets by the name of their mix
     models: list[Model]
 
 
@@ -74,3 +113,22 @@ class Results(msgspec.Struct):
 
     about: About
     records: list[Record]
+
+
+def load(path: Path) -> Results:
+    """Reads results.json; `ModelError` for any other file."""
+    if not path.is_file():
+        raise ModelError(f"no results {path}; modsoft-evaluate study --out {path.parent} makes them")
+    try:
+        return msgspec.json.decode(read_text(path), type=Results)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise ModelError(
+            f"{path}: not the results of this version ({error}); run modsoft-evaluate study --only measure"
+        ) from error
+
+
+def dumped(results: Results) -> str:
+    """JSON with one record a line, so that two results can be compared line by line."""
+    lines = ",\n  ".join(json.dumps(each, ensure_ascii=False) for each in msgspec.to_builtins(results.records))
+    head = json.dumps(msgspec.to_builtins(results.about), indent=1, ensure_ascii=False)
+    return f'{{"about": {head},\n "records": [\n  {lines}\n ]}}\n'

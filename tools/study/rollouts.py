@@ -1,4 +1,4 @@
-"""Every closed-loop run of the study: exported models on simulated robots, many at once, each kept as an .npz."""
+"""The stage of the closed-loop runs: exported models on simulated robots, in batches, each run stored as an .npz."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from modsoft.runtime.files import written
 from modsoft.study import perturbations, stages
 from modsoft.study.paths import NOT_READABLE, Folder
 from modsoft.study.plan import Plan, Run
-from modsoft.study.scheduler import Stage, Told
+from modsoft.study.scheduler import AddProgress, Stage
 from modsoft.training import made_from
 from modsoft.training.simulation.fleet import simulated
 from modsoft.training.simulation.rollout import ControllerSetup, Rollout, rollout
 
-TOGETHER = 16  # robots of a batch: two blocks of the kernel's widest vectors
-# What makes a run, beside the model; the modules that these import count too.
+BATCH_SIZE = 16  # robots: two blocks of the kernel's widest vectors
+# The code that a run depends on, with all that these modules import.
 MODULES = [
     "modsoft.runtime.control.model",
     "modsoft.runtime.control.tasks",
@@ -36,25 +36,25 @@ MODULES = [
     "modsoft.training.simulation.fleet",
     "modsoft.study.perturbations",
 ]
-STEP_S = 4e-3  # of one core, for a control step of one robot of four modules, about
+STEP_S = 4e-3  # estimate for a control step of one robot of four modules on one core
 
 
-class Kept(NamedTuple):
-    """A run as it lies in the folder."""
+class StoredRun(NamedTuple):
+    """A run as stored in the folder."""
 
-    flight: Rollout
+    rollout: Rollout
     desired: Array  # (K, N, 3)
 
 
-def rolling_out(plan: Plan, folder: Folder, jobs: int) -> Stage:
-    """runs/*.npz. A run is made again when its model changed, or anything else that shapes it."""
+def rollout_stage(plan: Plan, folder: Folder, jobs: int) -> Stage:
+    """runs/*.npz. A run is made again when its model or anything else that it depends on has changed."""
     models = {run.model for run in plan.runs}
-    seals = {model: stages.seal(folder, model) if folder.onnx(model).is_file() else "" for model in models}
-    missing = [run for run in plan.runs if meta(folder.run(run)) != identity(plan, run, seals[run.model])]
+    sha256 = {model: stages.onnx_sha256(folder, model) if folder.onnx(model).is_file() else "" for model in models}
+    missing = [run for run in plan.runs if stored_identity(folder.run(run)) != identity(plan, run, sha256[run.model])]
     batches = [
-        tuple(batch)
-        for alike in _alike(missing)
-        for batch in (alike[first : first + TOGETHER] for first in range(0, len(alike), TOGETHER))
+        tuple(runs[first : first + BATCH_SIZE])
+        for runs in _by_robot(missing)
+        for first in range(0, len(runs), BATCH_SIZE)
     ]
     return Stage("rollout", batches, partial(_rollout, plan, folder), partial(rollout_s, plan))
 
@@ -63,24 +63,24 @@ def rollout_s(plan: Plan, batch: Sequence[Run]) -> float:
     return (plan.steps or 250) * STEP_S * batch[0].modules / 4 * max(8, len(batch))
 
 
-def _alike(runs: Sequence[Run]) -> list[list[Run]]:
-    """Runs that can share a fleet: as many modules, the same plant."""
+def _by_robot(runs: Sequence[Run]) -> list[list[Run]]:
+    """Runs grouped by their simulated robot, so that each group can share a fleet."""
 
-    def of_fleet(run: Run) -> tuple[int, str]:
-        return run.modules, repr(perturbations.plant(run.disturbance, run.modules, run.model.seed))
+    def robot_of(run: Run) -> tuple[int, str]:
+        return run.modules, repr(perturbations.robot_properties(run.perturbation, run.modules, run.model.seed))
 
-    return [list(group) for _, group in itertools.groupby(sorted(runs, key=of_fleet), key=of_fleet)]
+    return [list(group) for _, group in itertools.groupby(sorted(runs, key=robot_of), key=robot_of)]
 
 
-def identity(plan: Plan, run: Run, seal: str) -> dict[str, Any]:
-    """All that the numbers of a run depend on, as plain values."""
+def identity(plan: Plan, run: Run, model_sha256: str) -> dict[str, Any]:
+    """What the numbers of a run depend on."""
     return {
         "model": run.model.name,
-        "model_sha256": seal,
+        "model_sha256": model_sha256,
         "task": run.task,
         "modules": run.modules,
         "correction": run.correction,
-        "disturbance": run.disturbance,
+        "perturbation": run.perturbation,
         "seed": run.model.seed,
         "steps": len(desired_of(plan, run.task, run.modules)),
         "code_sha256": code_sha256(),
@@ -89,59 +89,59 @@ def identity(plan: Plan, run: Run, seal: str) -> dict[str, Any]:
 
 @functools.cache
 def code_sha256() -> str:
-    """Digest of the source code that shapes a run, the compiled kernel's included."""
+    """Digest of the source code that a run depends on, the compiled kernel's included."""
     return made_from.digest({}, modules=MODULES)
 
 
 def desired_of(plan: Plan, name: str, modules: int) -> Array:
-    """The task (K, N, 3), cut where the plan has shorter ones."""
+    """The desired configurations (K, N, 3) of a task, as many steps as the plan has."""
     return task(name, "cable", modules)[: plan.steps]
 
 
-def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], told: Told) -> None:
+def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], add_progress: AddProgress) -> None:
     first = batch[0]
     robot = robots.load(f"cable-{first.modules}")
     models = {run.model: Model.load(folder.onnx(run.model)) for run in batch}
     for each in models.values():
         each.check(robot)
-    pilots = [
+    setups = [
         ControllerSetup(
             robot,
             models[run.model].actuate,
             models[run.model].history,
             desired_of(plan, run.task, run.modules),
             corrections.by_name(run.correction, run.modules),
-            perturbations.measure(run.disturbance, run.modules, run.model.seed),
+            perturbations.measurement(run.perturbation, run.modules, run.model.seed),
         )
         for run in batch
     ]
-    variant = perturbations.plant(first.disturbance, first.modules, first.model.seed)
-    flown = simulated("cable", first.modules, len(batch), **variant)
-    seals = {model: stages.seal(folder, model) for model in models}
-    for run, pilot, flight in zip(batch, pilots, rollout(flown, pilots).robots(), strict=True):
-        if not np.isfinite(flight.configuration).all():
-            raise ModelError(f"{run.name}: the simulated robot flew apart; no number is made of this run")
-        keep(folder.run(run), identity(plan, run, seals[run.model]), flight, pilot.desired)
+    properties = perturbations.robot_properties(first.perturbation, first.modules, first.model.seed)
+    simulator = simulated("cable", first.modules, len(batch), **properties)
+    sha256 = {model: stages.onnx_sha256(folder, model) for model in models}
+    for run, setup, motion in zip(batch, setups, rollout(simulator, setups).robots(), strict=True):
+        if not np.isfinite(motion.configuration).all():
+            raise ModelError(f"{run.name}: the simulated robot diverged; expected finite configurations")
+        store(folder.run(run), identity(plan, run, sha256[run.model]), motion, setup.desired)
 
 
-def keep(path: Path, about: dict[str, Any], flight: Rollout, desired: Array) -> None:
+def store(path: Path, depends_on: dict[str, Any], motion: Rollout, desired: Array) -> None:
     """Writes a run: configuration (K + 1, N, 3), actions (K, N, A), positions (K + 1, N, 3), m, directors
     (K + 1, N, 3, 3), desired (K, N, 3), meta (JSON)."""
     with written(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, meta=json.dumps(about, sort_keys=True), desired=desired, **flight._asdict())
+        np.savez_compressed(file, meta=json.dumps(depends_on, sort_keys=True), desired=desired, **motion._asdict())
 
 
-def read(path: Path) -> Kept:
-    """A run by its file; `ModelError` where there is none that can be read."""
+def read(path: Path) -> StoredRun:
+    """Reads a run; `ModelError` if the file cannot be read."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            return Kept(Rollout(*(file[name] for name in Rollout._fields)), file["desired"])
+            return StoredRun(Rollout(*(file[name] for name in Rollout._fields)), file["desired"])
     except NOT_READABLE as error:
-        raise ModelError(f"{path}: no run that can be read ({error}); delete it and run again") from error
+        raise ModelError(f"{path}: no readable run ({error}); delete it and run the study again") from error
 
 
-def meta(path: Path) -> dict[str, Any] | None:
-    """What a run says of itself; None where there is none, or a damaged one, which is made again."""
+def stored_identity(path: Path) -> dict[str, Any] | None:
+    """What a stored run depends on; None if the file is missing or damaged, so that it is made again."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return json.loads(str(file["meta"]))

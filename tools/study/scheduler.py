@@ -1,4 +1,4 @@
-"""The work of a stage dealt out to processes, with one line that shows how far it is."""
+"""Runs the items of a stage in several processes, with one line that shows the progress."""
 
 from __future__ import annotations
 
@@ -14,86 +14,86 @@ from tqdm import tqdm
 
 from modsoft.training.data import workers
 
-LOOK_S = 0.5  # between two looks at how far the workers are
+REFRESH_S = 0.5  # between two updates of the line
 LINE = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 
-Told = Callable[[float], None]  # adds a share of an item's cost
+AddProgress = Callable[[float], None]  # adds a fraction of an item's cost
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What is left to do of one kind. do(item, told) makes what an item stands for and can tell how far it is.
+    """The remaining items of one kind. do(item, add_progress) makes an item and may report its progress.
 
-    cost_s: seconds that an item takes on one core, about.
+    cost_s: estimated seconds of an item on one core.
     """
 
     name: str
     items: Sequence[Any]
-    do: Callable[[Any, Told], None]
+    do: Callable[[Any, AddProgress], None]
     cost_s: Callable[[Any], float]
-    alone: bool = False  # one item after the other, in this process, since each uses all processes itself
+    alone: bool = False  # one item after the other in this process, since each uses all processes itself
 
     def expected_s(self, jobs: int) -> float:
-        """Of wall clock, about: no sooner than the dearest item is done."""
+        """Estimated wall-clock time, at least that of the longest item."""
         costs = [self.cost_s(item) for item in self.items]
         return sum(costs) / jobs if self.alone or not costs else max(sum(costs) / jobs, *costs)
 
     def run(self, jobs: int) -> None:
-        """Every item, in `jobs` processes; the dearest first, so that none is left over at the end."""
+        """Makes every item in `jobs` processes, the longest first, so that the processes end together."""
         if not self.items:
-            print(f"{self.name}: all there", file=sys.stderr)
+            print(f"{self.name}: nothing left to do", file=sys.stderr)
             return
-        priced = sorted(((self.cost_s(item), index) for index, item in enumerate(self.items)), reverse=True)
-        order = [(self.items[index], cost) for cost, index in priced]
+        by_cost = sorted(((self.cost_s(item), index) for index, item in enumerate(self.items)), reverse=True)
+        order = [(self.items[index], cost) for cost, index in by_cost]
         done = multiprocessing.get_context("spawn").Value("d", 0.0)
-        with _Bar(self.name, sum(cost for cost, _ in priced), len(order), done) as bar:
-            for _ in workers.run(_Counted(self.do, done), order, 1 if self.alone else jobs):
-                bar.finished += 1
+        with _ProgressLine(self.name, sum(cost for cost, _ in by_cost), len(order), done) as line:
+            for _ in workers.run(_CountedWork(self.do, done), order, 1 if self.alone else jobs):
+                line.finished += 1
 
 
-class _Counted:
-    """An item's work, told to the bar; goes to the workers whole."""
+class _CountedWork:
+    """Makes an item and adds its cost to `done`, s; is sent to the worker processes."""
 
-    def __init__(self, do: Callable[[Any, Told], None], done: Synchronized[float]):
+    def __init__(self, do: Callable[[Any, AddProgress], None], done: Synchronized[float]):
         self.do, self.done = do, done
 
-    def __call__(self, priced: tuple[Any, float]) -> None:
-        (item, cost_s), told = priced, 0.0
+    def __call__(self, item_and_cost: tuple[Any, float]) -> None:
+        (item, cost_s), added = item_and_cost, 0.0
 
-        def tell(share: float) -> None:
-            nonlocal told
+        def add_progress(fraction: float) -> None:
+            nonlocal added
             with self.done.get_lock():
-                self.done.value += share * cost_s
-            told += share
+                self.done.value += fraction * cost_s
+            added += fraction
 
-        self.do(item, tell)
-        tell(1.0 - told)
+        self.do(item, add_progress)
+        add_progress(1.0 - added)
 
 
-class _Bar:
-    """A line on standard error that a thread keeps up to date while the work goes on."""
+class _ProgressLine:
+    """A line on standard error, updated by a thread during the work."""
 
-    def __init__(self, what: str, cost_s: float, items: int, done: Synchronized[float]):
+    def __init__(self, name: str, cost_s: float, items: int, done: Synchronized[float]):
         self.finished, self._items, self._done = 0, items, done
-        often_s = LOOK_S if sys.stderr.isatty() else 60.0
-        self._bar = tqdm(total=cost_s, desc=what, bar_format=LINE, mininterval=often_s, maxinterval=often_s)
+        interval_s = REFRESH_S if sys.stderr.isatty() else 60.0
+        self._bar = tqdm(total=cost_s, desc=name, bar_format=LINE, mininterval=interval_s, maxinterval=interval_s)
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread = threading.Thread(target=self._refresh_until_stopped, daemon=True)
 
-    def __enter__(self) -> _Bar:
+    def __enter__(self) -> _ProgressLine:
         self._thread.start()
         return self
 
     def __exit__(self, *_: Any) -> None:
         self._stop.set()
         self._thread.join()
-        self._look()
+        self._refresh()
         self._bar.close()
 
-    def _watch(self) -> None:
-        while not self._stop.wait(LOOK_S):
-            self._look()
+    def _refresh_until_stopped(self) -> None:
+        while not self._stop.wait(REFRESH_S):
+            self._refresh()
 
-    def _look(self) -> None:
+    def _refresh(self) -> None:
         self._bar.set_postfix_str(f"{self.finished} of {self._items} done", refresh=False)
         self._bar.update(min(self._done.get_obj().value, self._bar.total) - self._bar.n)
