@@ -7,23 +7,23 @@
 #include "frame.h"
 
 #define MAGIC 0x6d736674UL
-#define STARVED_MS 100 /* a watchdog of 120 ms, whose own clock may run fast, has bitten after more than this */
+#define STARVED_MS 100 /* less than the 120 ms of the watchdog, whose clock may run fast */
 
-/* Not cleared at start: survives a reset, and holds chance values after power-on. */
+/* Not cleared at start: keeps its values over a reset, and holds random values after power-on. */
 static struct {
   uint32_t magic;
   uint32_t id;
   uint32_t fed_ms;
-  uint8_t chance[24];
+  uint8_t noise[24];
 } memory __attribute__((section(".noinit")));
 static uint8_t flags_at_reset __attribute__((section(".noinit")));
 static uint32_t millis_at_reset __attribute__((section(".noinit")));
 static bool survived, starved;
 
-extern volatile unsigned long timer0_millis; /* what the core's millis() counts in */
+extern volatile unsigned long timer0_millis; /* the counter of the core's millis() */
 
-/* Runs before main and before the variables are cleared: a watchdog that bit stays armed with its shortest time, and
- * would bite again before setup() is reached. */
+/* Runs before main and before the variables are cleared: after a watchdog reset the watchdog stays on with its shortest
+ * time, and would reset the chip again before setup(). */
 void boot_early(void) __attribute__((naked, used, section(".init3")));
 void boot_early(void) {
   flags_at_reset = MCUSR;
@@ -54,8 +54,8 @@ uint8_t boot_reset_cause(void) {
   if (flags_at_reset & _BV(EXTRF)) {
     return RESET_CAUSE_EXTERNAL;
   }
-  /* The MEGA's bootloader clears the flags, but leaves most of the memory as it was: the clock stood far behind the
-   * last feeding if the watchdog bit. (Not if interrupts were off in the hang: that looks like an external reset.) */
+  /* The MEGA's bootloader clears the flags but keeps most of the memory: after a watchdog reset millis() is far past
+   * the last feeding. (A hang with interrupts off stops millis() as well, and looks like an external reset.) */
   if (!survived) {
     return RESET_CAUSE_POWER_ON;
   }

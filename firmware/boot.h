@@ -1,4 +1,4 @@
-/* The watchdog, and what is known about the last reset. */
+/* The watchdog, and the cause of the last reset. */
 #ifndef BOOT_H
 #define BOOT_H
 
@@ -8,13 +8,13 @@
 extern "C" {
 #endif
 
-/* A number that differs from the one before the last reset, so that the host notices one. Call once. */
+/* A number that changes at every reset, by which the host notices a reset. Call once. */
 uint32_t boot_next_id(void);
 
 /* enum reset_cause; call after boot_next_id. */
 uint8_t boot_reset_cause(void);
 
-/* Feeds the hardware watchdog and remembers when. */
+/* Feeds the hardware watchdog and stores the time. */
 void boot_feed_watchdog(uint32_t now_ms);
 
 #ifdef __cplusplus

@@ -1,5 +1,5 @@
-// The board between the lab PC and the valves. Thin on purpose: what it decides stands in supervisor.c and output.c,
-// which are tested on a PC; here they meet the serial port, the pins and the clock.
+// Connects the lab PC to the valves. All decisions are in supervisor.c and output.c, which are tested on a PC; this
+// sketch connects them to the serial port, the pins and the clock.
 //
 // Before flashing, check limits.h (your valves' full scale) and pins.h (your wiring).
 
@@ -12,12 +12,12 @@
 #include "pwm.h"
 #include "sensors.h"
 
-#define BYTES_PER_PASS 8  // each way; a pass comes with every byte, or sooner
+#define BYTES_PER_PASS 8  // in each direction; every byte starts a pass
 
 static struct supervisor board;
 static struct sensors inputs;
 
-// Fails when the converter stops: the supervisor would then compare readings that never change.
+// Fails when the converter stops, because the supervisor must not rely on old readings.
 static uint8_t take_reading() { return sensors_poll(&inputs) ? CHECK_ADC : 0; }
 
 static uint8_t drive_pins() {
@@ -41,13 +41,13 @@ void loop() {
   static uint32_t last_ms;
   const uint32_t now_ms = millis();
 
-  // One frame and a few bytes a pass, so that a flood cannot keep the checks from running.
+  // At most one frame and a few bytes in a pass, so that a flood of bytes cannot delay the checks.
   for (uint8_t i = 0; i < BYTES_PER_PASS && Serial.available() > 0; i++) {
     if (supervisor_receive(&board, (uint8_t)Serial.read(), now_ms)) {
-      break;  // what is left waits for the next interrupt, as the sleep below does
+      break;  // the next interrupt starts the pass that takes the rest
     }
   }
-  if (now_ms != last_ms) {  // every byte wakes us; a millisecond is soon enough for all the rest
+  if (now_ms != last_ms) {  // every byte starts a pass; the rest runs once a millisecond
     last_ms = now_ms;
     uint8_t checks = 0;
     checks |= take_reading();
@@ -57,7 +57,7 @@ void loop() {
       boot_feed_watchdog(now_ms);
     }
   }
-  // Never waits for the host to read, and never long for the copying: every byte that leaves wakes us for more.
+  // Never waits for the host to read. A few bytes at a time, because every byte sent starts a pass that adds more.
   for (uint8_t i = 0; i < BYTES_PER_PASS && Serial.availableForWrite() > 0; i++) {
     const int16_t next = supervisor_next_byte(&board);
     if (next < 0) {

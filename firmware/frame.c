@@ -3,12 +3,12 @@
 #include <string.h>
 
 #ifdef __AVR__
-#define IN_FLASH __flash /* the chip has 256 KiB of it, and 8 KiB of memory */
+#define IN_FLASH __flash /* the chip has 256 KiB of flash and 8 KiB of RAM */
 #else
 #define IN_FLASH
 #endif
 
-/* What a byte does to the CRC is the sum (exclusive or) of what its bits do, so these eight make the whole table. */
+/* The CRC is linear: the entry of a byte is the exclusive or of the entries of its bits, so eight define the table. */
 #define BIT(byte, bit, effect) ((byte) >> (bit) & 1 ? effect : 0)
 #define ENTRY(byte)                                                                                                    \
   (BIT(byte, 0, 0x77073096UL) ^ BIT(byte, 1, 0xee0e612cUL) ^ BIT(byte, 2, 0x076dc419UL) ^ BIT(byte, 3, 0x0edb8832UL) ^ \
@@ -41,7 +41,7 @@ void frame_take(struct frame_parser *parser, uint8_t byte) {
     parser->remaining--;
     return;
   }
-  /* A code byte: a run of byte - 1 follows. Runs of 254, which no zero ends, are longer than any frame. */
+  /* A code byte: a run of byte - 1 bytes follows. Runs of 254, which end without a zero, are longer than any frame. */
   if (parser->zero_pending) {
     append(parser, 0);
   }
@@ -74,7 +74,7 @@ enum frame_event frame_end(struct frame_parser *parser, struct frame *frame) {
 
 uint8_t frame_encode(uint8_t *encoded, uint8_t type, uint8_t seq, uint8_t session, const void *payload,
                      uint8_t length) {
-  /* Stuffed where it lies: a COBS code byte takes the place of the zero before its run. */
+  /* Encoded in place: a COBS code byte replaces the zero before its run. */
   uint8_t *body = encoded + 2;
   uint8_t size = (uint8_t)(PROTOCOL_HEADER_LENGTH + length);
   uint8_t *code = encoded + 1;

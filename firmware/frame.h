@@ -1,4 +1,4 @@
-/* Frames on the wire: 0x00 | COBS(type, seq, session, payload, crc32) | 0x00. Knows nothing of what they mean. */
+/* Frames on the wire: 0x00 | COBS(type, seq, session, payload, crc32) | 0x00. The supervisor reads the payloads. */
 #ifndef FRAME_H
 #define FRAME_H
 
@@ -23,22 +23,22 @@ enum frame_event { FRAME_NONE, FRAME_GOOD, FRAME_BAD };
 
 /* Decodes byte by byte; zeroed memory is a valid start. */
 struct frame_parser {
-  uint8_t length;    /* of what is decoded so far */
+  uint8_t length;    /* decoded so far */
   uint8_t remaining; /* bytes of the current COBS run still to come */
   bool zero_pending; /* the last run ends in a zero, unless the frame ends first */
-  bool started;      /* something came since the last delimiter */
-  bool broken;       /* too long: dropped up to the next delimiter */
+  bool started;      /* a byte arrived since the last delimiter */
+  bool broken;       /* too long: dropped until the next delimiter */
   uint8_t decoded[PROTOCOL_MAX_DECODED];
 };
 
-/* A byte has come that is not the delimiter. */
+/* Takes a byte that is not the delimiter. */
 void frame_take(struct frame_parser *parser, uint8_t byte);
 
-/* The delimiter has come. FRAME_GOOD: *frame is set. FRAME_BAD: something ended that was no frame. */
+/* Takes the delimiter. FRAME_GOOD: *frame is set. FRAME_BAD: the bytes before it are no valid frame. */
 enum frame_event frame_end(struct frame_parser *parser, struct frame *frame);
 
-/* Result of frame_encode for a payload of this length: both delimiters, the COBS code byte (bodies are shorter than the
- * 254 bytes that would need a second one), header and CRC. */
+/* Length of an encoded frame: both delimiters, one COBS code byte (254 bytes and more would need a second one), header,
+ * payload and CRC. */
 #define FRAME_ENCODED_LENGTH(length) ((length) + PROTOCOL_HEADER_LENGTH + PROTOCOL_CRC_LENGTH + 3)
 #define FRAME_MAX_ENCODED (PROTOCOL_MAX_ENCODED + 2)
 

@@ -1,4 +1,4 @@
-/* What this board is allowed to do. Check the first block against your valves before flashing.
+/* Limits of this board. Check the first block against your valves before flashing.
  *
  * Pressures are in the wire's unit, 10 Pa: 0.35 bar is 3500. The host compares these values with its robot file
  * and refuses to arm a board that differs. */
@@ -7,9 +7,9 @@
 
 #include "protocol.h"
 
-/* ---- Yours to set ------------------------------------------------------------------------------------------ */
+/* ---- To be set for your valves ----------------------------------------------------------------------------- */
 
-/* READ IT OFF THE LABEL OF YOUR VALVES: the pressure a full command (10 V) stands for, here 3 bar. */
+/* READ IT FROM THE LABEL OF YOUR VALVES: the pressure at full command (10 V), here 3 bar. */
 #ifndef P_FULL
 #define P_FULL 30000UL
 #endif
@@ -23,7 +23,7 @@
 #define SLEW 20000U
 #endif
 
-/* Sensors: 0 V is no pressure, 5 V is this one, linear between. Which channels have one is said in pins.h. */
+/* Pressure at which a sensor gives 5 V; 0 V is no pressure, linear between. Which channels have one: pins.h. */
 #define SENSOR_FULL 10000L
 
 /* ---- Safety times and margins ------------------------------------------------------------------------------ */
@@ -31,14 +31,14 @@
 #define LINK_TIMEOUT_MS 300     /* no valid frame of the session: ramp vent */
 #define CONTROL_TIMEOUT_MS 1000 /* the control loop's tick stands still: ramp vent */
 #define P_OVER (P_MAX + 1000)   /* a sensor above this ... */
-#define OVER_PRESSURE_MS 100    /* ... for so long: dump */
-#define P_DISAGREE 500          /* a sensor so far from what is applied ... */
-#define DISAGREE_MS 2000        /* ... for so long: ramp vent (below: leak; above: sensor or valve stuck) */
+#define OVER_PRESSURE_MS 100    /* ... for this time: dump */
+#define P_DISAGREE 500          /* a sensor this far from the applied pressure ... */
+#define DISAGREE_MS 2000        /* ... for this time: ramp vent (below: leak; above: sensor or valve stuck) */
 #define P_DOWN 500              /* a channel that measures this or more still holds pressure: no fault is cleared */
 
 #define FIRMWARE_VERSION 1
 
-/* A ramp from P_MAX after a lost link has to end 670 ms after the last frame; 40 ms are kept for the loop. */
+/* After a lost link a ramp from P_MAX must end 670 ms after the last frame; the loop takes up to 40 ms of that. */
 _Static_assert(LINK_TIMEOUT_MS + 1000UL * P_MAX / SLEW <= 630, "SLEW is too slow to vent in time");
 _Static_assert(0 < P_MIN && P_MIN < P_MAX && P_OVER < P_FULL, "limits out of order: P_MIN < P_MAX < P_OVER < P_FULL");
 _Static_assert(P_OVER < SENSOR_FULL && SENSOR_FULL <= 32767, "the sensors cannot see an over-pressure");

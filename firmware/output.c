@@ -11,7 +11,7 @@
 #define LARGER(a, b) ((a) > (b) ? (a) : (b))
 
 void output_step(struct output_stage *stage, const int16_t targets[PROTOCOL_CHANNELS], uint32_t elapsed_ms) {
-  /* After a stall the outputs go on from where they are instead of leaping. */
+  /* A stall of the loop counts as STALL_MS at most, so that no output jumps after it. */
   uint32_t budget = SLEW * SMALLER(elapsed_ms, STALL_MS) + stage->remainder;
   int16_t step = (int16_t)(budget / 1000);
   stage->remainder = (uint16_t)(budget % 1000);
@@ -36,7 +36,7 @@ bool output_is_vented(const struct output_stage *stage) {
 }
 
 uint16_t output_counts(const struct output_stage *stage, uint8_t channel) {
-  /* applied * PWM_COUNTS / P_FULL, rounded, with 16 bits behind the point: a multiplication, because twelve 32-bit
+  /* applied * PWM_COUNTS / P_FULL, rounded, with 16 fractional bits: a multiplication, because twelve 32-bit
    * divisions take half a millisecond. */
   const uint32_t counts_per_unit = ((PWM_COUNTS << 16) + P_FULL / 2) / P_FULL;
   const uint32_t half = 1UL << 15;

@@ -1,4 +1,4 @@
-/* The output stage: clamp, slew limit, pressure to PWM counts. Nothing else decides what a valve gets. */
+/* The output stage: clamp, slew limit, pressure to PWM counts. No other code sets the output of a valve. */
 #ifndef OUTPUT_H
 #define OUTPUT_H
 
@@ -12,8 +12,8 @@ extern "C" {
 #endif
 
 struct output_stage {
-  int16_t applied[PROTOCOL_CHANNELS]; /* 10 Pa, what the valves are told now */
-  uint16_t remainder;                 /* part of a slew step not yet spent, 10 Pa / 1000 */
+  int16_t applied[PROTOCOL_CHANNELS]; /* 10 Pa, present command of the valves */
+  uint16_t remainder;                 /* part of a slew step not yet used, 10 Pa / 1000 */
 };
 
 /* Moves every channel towards its target, clamped to 0 .. P_MAX, by no more than the slew limit allows in elapsed_ms.
@@ -26,7 +26,7 @@ void output_dump(struct output_stage *stage);
 /* True where every channel is at 0. */
 bool output_is_vented(const struct output_stage *stage);
 
-/* PWM counts, 0 to PWM_COUNTS, of a channel; 0 stands for "disconnected". */
+/* PWM counts, 0 to PWM_COUNTS, of a channel; at 0 the pin is disconnected. */
 uint16_t output_counts(const struct output_stage *stage, uint8_t channel);
 
 #ifdef __cplusplus

@@ -1,4 +1,4 @@
-/* Which pin drives which valve, and which input senses it. For the Arduino MEGA 2560: its twelve 16-bit PWM outputs. */
+/* Pin of each valve and input of each sensor. For the Arduino MEGA 2560: its twelve 16-bit PWM outputs. */
 #ifndef PINS_H
 #define PINS_H
 

@@ -70,7 +70,7 @@ enum message {
   MESSAGE_NACK = 0x91,
 };
 
-/* Payloads as they lie on the wire: packed, little endian, as the AVR and the usual PCs keep them. */
+/* Payloads as on the wire: packed, little endian, which is the byte order of the AVR and of PCs. */
 struct __attribute__((packed)) hello_req {
   uint32_t protocol_hash;
 };
@@ -137,7 +137,7 @@ struct __attribute__((packed)) nack {
   uint8_t reason;
 };
 
-/* Payload length of a message from the host; -1 where there is no such message. */
+/* Payload length of a message from the host; -1 if there is no such message. */
 static inline int16_t protocol_payload_length(uint8_t message) {
   switch (message) {
     case MESSAGE_HELLO_REQ:

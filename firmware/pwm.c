@@ -5,8 +5,8 @@
 
 #include "pins.h"
 
-/* Fast PWM with the top in ICRn (mode 14), no prescaler, nothing connected yet. The Arduino core has set these timers
- * up for its own 8-bit analogWrite before. */
+/* Fast PWM with the top in ICRn (mode 14), no prescaler, no output connected yet. Before this the timers have the
+ * settings of the Arduino core, for its 8-bit analogWrite. */
 #define BEGIN_TIMER(n)         \
   TCCR##n##B = 0;              \
   TCCR##n##A = _BV(WGM##n##1); \
@@ -43,7 +43,7 @@ void pwm_begin(void) {
 }
 
 void pwm_write(uint8_t channel, uint16_t counts) {
-  /* A 16-bit register is written through one temporary byte that all of them share. */
+  /* All 16-bit registers are written through one shared temporary byte. */
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
     switch (channel) { CHANNEL_TABLE(WRITE_PIN) }
   }

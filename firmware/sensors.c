@@ -10,8 +10,8 @@
 #endif
 
 #define INPUTS 8
-/* After the last input, once in many rounds: the 1.1 V reference measured against the supply. It is slow to settle
- * when it is switched to, so its first conversion is thrown away. */
+/* After the last input, once in ROUNDS_PER_SUPPLY rounds: the 1.1 V reference, measured against the supply. It settles
+ * slowly after it is selected, so its first conversion is discarded. */
 #define SETTLING INPUTS
 #define SUPPLY (INPUTS + 1)
 #define ROUNDS_PER_SUPPLY 64

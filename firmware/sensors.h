@@ -1,4 +1,4 @@
-/* Pressure sensors and supply voltage, one conversion at a time, never waited for. */
+/* Pressure sensors and supply voltage. One conversion at a time; no function waits for it. */
 #ifndef SENSORS_H
 #define SENSORS_H
 
@@ -14,8 +14,8 @@ extern "C" {
 struct sensors {
   int16_t measured[PROTOCOL_CHANNELS]; /* 10 Pa; PROTOCOL_NOT_MEASURED without a sensor or before its first reading */
   uint16_t supply_mv;                  /* 5 V rail; 0 before its first reading */
-  uint8_t input;                       /* being converted */
-  uint8_t rounds;                      /* since the supply was measured */
+  uint8_t input;                       /* in conversion */
+  uint8_t rounds;                      /* since the last measurement of the supply */
 };
 
 void sensors_begin(struct sensors *sensors);

@@ -15,7 +15,7 @@ static void send(struct supervisor *s, uint8_t type, const void *payload, uint8_
   uint8_t head = s->tx_head;
   uint8_t room = (uint8_t)(s->tx_tail - head - 1); /* a full ring would look like an empty one */
   if (FRAME_ENCODED_LENGTH(length) > room) {
-    return; /* before the work of encoding: the line carries 25 bytes a millisecond, whatever is asked of us */
+    return; /* checked before the encoding: a host may ask for more answers than the port can send */
   }
   uint16_t to_end = (uint16_t)(sizeof s->tx - head);
   uint8_t size = frame_encode(encoded, type, s->tx_seq++, s->session, payload, length);
@@ -102,7 +102,7 @@ static void feed_control(struct supervisor *s, uint32_t tick, uint32_t now_ms) {
 static void on_hello_req(struct supervisor *s, const struct frame *frame) {
   struct hello_req request;
   memcpy(&request, frame->payload, sizeof request);
-  send_hello(s); /* always: a stranger has to learn whom it met */
+  send_hello(s); /* always: a host with another protocol identifies the board by it */
   if (request.protocol_hash != PROTOCOL_HASH) {
     refuse(s, frame, NACK_REASON_HASH);
   }
@@ -116,14 +116,14 @@ static void on_arm(struct supervisor *s, const struct frame *frame, uint32_t now
     return;
   }
   if (arm.boot_id == s->boot_id && s->state == STATE_ARMED && arm.new_session == s->session) {
-    send_status(s); /* our answer to the first one was lost */
+    send_status(s); /* repeated, because the answer to the first one was lost */
     return;
   }
   if (arm.boot_id != s->boot_id || arm.new_session != (s->session == 255 ? 1 : s->session + 1)) {
     refuse(s, frame, NACK_REASON_SESSION);
     return;
   }
-  if (s->state != STATE_IDLE || !output_is_vented(&s->output) || !s->hears_heartbeats ||
+  if (s->state != STATE_IDLE || !output_is_vented(&s->output) || !s->heartbeats_heard ||
       now_ms - s->last_heartbeat_ms > LINK_TIMEOUT_MS || now_ms - s->heartbeats_since_ms < PROTOCOL_ARM_AFTER_MS) {
     refuse(s, frame, NACK_REASON_STATE);
     return;
@@ -154,7 +154,7 @@ static void on_set(struct supervisor *s, const struct frame *frame, uint32_t now
     return;
   }
   if (ahead == 0 && s->state == STATE_RUNNING) {
-    send_status(s); /* a duplicate: told again, not applied again, and no sign of life */
+    send_status(s); /* a duplicate: acknowledged again, not applied again; it feeds no timer */
     return;
   }
   if (ahead == 0 || ahead > PROTOCOL_SEQUENCE_WINDOW || (int32_t)(set.tick - s->set_tick) < 0) {
@@ -164,7 +164,7 @@ static void on_set(struct supervisor *s, const struct frame *frame, uint32_t now
   for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
     int16_t pressure = set.pressures[channel];
     if (pressure < 0 || pressure > P_MAX || (pressure != 0 && !((s->channels >> channel) & 1))) {
-      refuse(s, frame, NACK_REASON_RANGE); /* never half a frame */
+      refuse(s, frame, NACK_REASON_RANGE); /* the whole frame is refused */
       return;
     }
   }
@@ -191,11 +191,11 @@ static void on_heartbeat(struct supervisor *s, const struct frame *frame, uint32
     feed_link(s, now_ms);
     feed_control(s, heartbeat.tick, now_ms);
   } else {
-    s->tick = heartbeat.tick; /* a new host may count from anywhere */
+    s->tick = heartbeat.tick; /* a new host may start to count anywhere */
   }
-  if (!s->hears_heartbeats || now_ms - s->last_heartbeat_ms > LINK_TIMEOUT_MS) {
+  if (!s->heartbeats_heard || now_ms - s->last_heartbeat_ms > LINK_TIMEOUT_MS) {
     s->heartbeats_since_ms = now_ms;
-    s->hears_heartbeats = true;
+    s->heartbeats_heard = true;
   }
   s->last_heartbeat_ms = now_ms;
 }
@@ -206,7 +206,7 @@ static void on_vent(struct supervisor *s, const struct frame *frame) {
   if (in_session(s)) {
     s->state = STATE_IDLE;
   }
-  if (vent.mode != VENT_MODE_RAMP) { /* an unknown mode still has to vent; at once is the safe reading */
+  if (vent.mode != VENT_MODE_RAMP) { /* an unknown mode dumps: that is the safe choice */
     output_dump(&s->output);
   }
   send_status(s);
@@ -254,7 +254,7 @@ static void on_frame(struct supervisor *s, const struct frame *frame, uint32_t n
     case MESSAGE_VENT:
       on_vent(s, frame);
       break;
-    default: /* MESSAGE_CLEAR_FAULT: every other type has been refused above */
+    default: /* MESSAGE_CLEAR_FAULT: every other type was refused above */
       on_clear_fault(s, frame);
   }
 }
@@ -275,10 +275,10 @@ static uint8_t check_control(struct supervisor *s, uint32_t now_ms) {
   return CHECK_CONTROL;
 }
 
-/* Counts how long something has been the case; true when it has been for limit_ms. Counts anew after a minute, when
- * what it found has long been latched. */
-static bool lasts(uint16_t *counted_ms, bool is, uint32_t elapsed_ms, uint16_t limit_ms) {
-  uint32_t lasted_ms = is ? *counted_ms + elapsed_ms : 0;
+/* Counts how long a condition holds; returns true once it holds for limit_ms. The count wraps after 65 s, when the
+ * fault has long been latched. */
+static bool lasts(uint16_t *counted_ms, bool condition, uint32_t elapsed_ms, uint16_t limit_ms) {
+  uint32_t lasted_ms = condition ? *counted_ms + elapsed_ms : 0;
   *counted_ms = (uint16_t)lasted_ms;
   return lasted_ms >= limit_ms;
 }
@@ -286,7 +286,7 @@ static bool lasts(uint16_t *counted_ms, bool is, uint32_t elapsed_ms, uint16_t l
 static uint8_t check_sensors(struct supervisor *s, uint32_t elapsed_ms) {
   for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
     int16_t measured = s->measured[channel];
-    int16_t off;
+    int16_t difference;
     bool driven;
     if (measured == PROTOCOL_NOT_MEASURED) {
       continue;
@@ -294,12 +294,12 @@ static uint8_t check_sensors(struct supervisor *s, uint32_t elapsed_ms) {
     if (lasts(&s->over_ms[channel], measured > P_OVER, elapsed_ms, OVER_PRESSURE_MS)) {
       latch(s, FAULT_OVER_PRESSURE); /* in any state */
     }
-    off = (int16_t)(measured - s->output.applied[channel]); /* both lie between 0 and SENSOR_FULL */
+    difference = (int16_t)(measured - s->output.applied[channel]); /* both are between 0 and SENSOR_FULL */
     driven = s->state == STATE_RUNNING && ((s->channels >> channel) & 1);
-    if (lasts(&s->above_ms[channel], driven && off > P_DISAGREE, elapsed_ms, DISAGREE_MS)) {
+    if (lasts(&s->above_ms[channel], driven && difference > P_DISAGREE, elapsed_ms, DISAGREE_MS)) {
       latch(s, FAULT_SENSOR);
     }
-    if (lasts(&s->below_ms[channel], driven && off < -P_DISAGREE, elapsed_ms, DISAGREE_MS)) {
+    if (lasts(&s->below_ms[channel], driven && difference < -P_DISAGREE, elapsed_ms, DISAGREE_MS)) {
       latch(s, FAULT_LEAK);
     }
   }
@@ -327,7 +327,7 @@ void supervisor_init(struct supervisor *s, uint32_t boot_id, uint8_t reset_cause
   send_hello(s);
 }
 
-/* Not inlined: a byte that ends no frame need not pay for the room that the answers take on the stack. */
+/* Not inlined: only the end of a frame needs the stack space of the answers. */
 __attribute__((noinline)) static bool on_delimiter(struct supervisor *s, uint32_t now_ms) {
   struct frame frame;
   switch (frame_end(&s->parser, &frame)) {

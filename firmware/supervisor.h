@@ -1,10 +1,10 @@
-/* What the board does: states, timers, faults. Plain C without a clock, a port or a pin of its own, so that the very
- * same source runs in the tests and in the emulated boards; firmware.ino feeds it and carries out what it decides.
+/* The state machine of the board: states, timers, faults. Plain C that uses no clock, port or pin, so that the same
+ * source runs in the tests and in the emulated boards; firmware.ino connects it to the hardware.
  *
  *   BOOT -> IDLE -ARM-> ARMED -first SET-> RUNNING -VENT-> IDLE
- *   any  -> FAULT (latched, vents) -CLEAR_FAULT of exactly those faults, pressures down-> IDLE
+ *   any  -> FAULT (latched, vents) -CLEAR_FAULT with exactly these faults, pressures down-> IDLE
  *
- * Outputs follow set-points in RUNNING alone; in every other state their target is 0. */
+ * Outputs follow the set-points only in RUNNING; in every other state their target is 0. */
 #ifndef SUPERVISOR_H
 #define SUPERVISOR_H
 
@@ -41,19 +41,19 @@ struct supervisor {
   uint8_t session;   /* the last one armed; 0 before the first */
   uint16_t channels; /* bit c: this session drives channel c */
   uint8_t last_seq;  /* of the last SET accepted; in ARMED of the ARM */
-  uint32_t tick;     /* the host's control loop, as last told */
+  uint32_t tick;     /* counter of the host's control loop, last value received */
   uint32_t set_tick; /* of the last SET accepted */
   int16_t set_points[PROTOCOL_CHANNELS];
 
-  bool hears_heartbeats;
-  uint32_t heartbeats_since_ms; /* unbroken since */
+  bool heartbeats_heard;
+  uint32_t heartbeats_since_ms; /* start of the unbroken series */
   uint32_t last_heartbeat_ms;
   uint32_t last_valid_ms;    /* last frame that feeds the link timer */
   uint32_t last_progress_ms; /* last frame with a later tick */
 
   int16_t measured[PROTOCOL_CHANNELS];
-  uint16_t over_ms[PROTOCOL_CHANNELS];                               /* above P_OVER for so long */
-  uint16_t above_ms[PROTOCOL_CHANNELS], below_ms[PROTOCOL_CHANNELS]; /* off what is applied for so long */
+  uint16_t over_ms[PROTOCOL_CHANNELS];                               /* time above P_OVER */
+  uint16_t above_ms[PROTOCOL_CHANNELS], below_ms[PROTOCOL_CHANNELS]; /* time off the applied pressure */
   uint16_t supply_mv;
 
   struct output_stage output;
@@ -62,17 +62,17 @@ struct supervisor {
 
   uint32_t last_status_ms;
   uint8_t tx_seq;
-  uint8_t tx[256]; /* ring; its indices wrap by themselves */
+  uint8_t tx[256]; /* ring buffer; its 8-bit indices wrap at its size */
   uint8_t tx_head, tx_tail;
 };
 
-/* Starts vented, in BOOT, with the HELLO already queued. */
+/* Starts in BOOT, vented, with HELLO in the queue. */
 void supervisor_init(struct supervisor *s, uint32_t boot_id, uint8_t reset_cause, uint32_t now_ms);
 
-/* One byte from the host. Returns true when it ended a good frame, which has been carried out or refused then. */
+/* Takes one byte from the host. Returns true when it ends a valid frame, which then has been executed or refused. */
 bool supervisor_receive(struct supervisor *s, uint8_t byte, uint32_t now_ms);
 
-/* Once a loop: timers, faults, outputs, STATUS. measured is in 10 Pa, PROTOCOL_NOT_MEASURED where there is no sensor.
+/* Once per loop: timers, faults, outputs, STATUS. measured is in 10 Pa, PROTOCOL_NOT_MEASURED where there is no sensor.
  * Returns the bits of its checks, CHECK_UPDATE. */
 uint8_t supervisor_update(struct supervisor *s, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,
                           uint32_t now_ms);
@@ -80,7 +80,7 @@ uint8_t supervisor_update(struct supervisor *s, const int16_t measured[PROTOCOL_
 /* PWM counts of a channel, see output.h. */
 uint16_t supervisor_counts(const struct supervisor *s, uint8_t channel);
 
-/* Next byte for the host, or -1. What does not fit the queue is dropped as whole frames: the board never waits. */
+/* Next byte for the host, or -1. A frame that does not fit the queue is dropped whole: the board never waits. */
 int16_t supervisor_next_byte(struct supervisor *s);
 
 #ifdef __cplusplus

@@ -1,7 +1,7 @@
 """Line and branch coverage of the firmware by its native tests: a table, and exit code 1 below 100 %.
 
-Every file of `firmware/` that is compiled natively counts: the logic (frame.c, output.c, supervisor.c) and, on a chip
-of plain memory, what touches the hardware (pwm.c, sensors.c, boot.c).
+All files of `firmware/` that are compiled natively: the logic (frame.c, output.c, supervisor.c), and the files that
+access the hardware (pwm.c, sensors.c, boot.c), on a chip of plain memory.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ TESTS = ("test_frame.py", "test_output.py", "test_supervisor.py", "test_chip.py"
 
 
 def _run_tests() -> None:
-    """Build with counters, and run the tests on that build."""
+    """Build with counters and run the tests on that build."""
     shutil.rmtree(BUILD, ignore_errors=True)
     instrument = "INSTRUMENT=-O0 --coverage -fprofile-update=single"
     out = os.path.relpath(BUILD, ROOT / "firmware")
     subprocess.run(["make", "-s", "-C", str(ROOT / "firmware"), "native", f"OUT={out}", instrument], check=True)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
-    # The loops of `corrupt` assert no more than the tests do, and would cover a line that no test looks at.
+    # The loops of `corrupt` assert no more than the tests, and would cover lines that no test checks.
     command += ["-k", "not damaged_and_repeated", *(str(ROOT / "tests" / "firmware" / name) for name in TESTS)]
     tests = subprocess.run(command, cwd=ROOT, env={**os.environ, "MODSOFT_NATIVE_FIRMWARE": str(BUILD)}, check=False)
     if tests.returncode != 0:
-        sys.exit("coverage: the tests fail; first make them pass: make test")
+        sys.exit("coverage: the tests fail; correct that first, see make test")
 
 
 Counts = dict[tuple[str, int], int]
 
 
 def _count() -> tuple[Counts, dict[tuple[str, int, int], int]]:
-    """How often each (file, line) and each (file, line, branch) was taken, over all libraries together."""
+    """Return how often each (file, line) and each (file, line, branch) was executed, summed over all libraries."""
     lines: Counts = defaultdict(int)
     branches: dict[tuple[str, int, int], int] = defaultdict(int)
     for counters in sorted(BUILD.rglob("*.gcda")):
@@ -56,7 +56,7 @@ def _count() -> tuple[Counts, dict[tuple[str, int, int], int]]:
 
 
 def _table(lines: Counts, branches: dict[tuple[str, int, int], int]) -> bool:
-    """Print it; True where all is covered."""
+    """Print the table; return whether everything is covered."""
     complete = True
     print(f"{'file':14} {'lines':>12} {'branches':>12}   not covered")
     for name in FILES:
@@ -74,7 +74,7 @@ def _table(lines: Counts, branches: dict[tuple[str, int, int], int]) -> bool:
 def main() -> None:
     _run_tests()
     if not _table(*_count()):
-        sys.exit("coverage: below 100 %: test what is missing, or delete it where it cannot be reached")
+        sys.exit("coverage: below 100 %: test the missing lines, or delete unreachable code")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write firmware/protocol.h from runtime/board/protocol.py; `--check` only says whether it is up to date."""
+"""Write firmware/protocol.h from runtime/board/protocol.py; `--check` only reports whether it is up to date."""
 
 from __future__ import annotations
 
@@ -38,9 +38,7 @@ def header() -> str:
     lines += ["", "enum message {"]
     lines += [f"  MESSAGE_{name} = 0x{identifier:02x}," for name, identifier, _ in protocol.MESSAGES]
     lines += ["};", ""]
-    lines.append(
-        "/* Payloads as they lie on the wire: packed, little endian, as the AVR and the usual PCs keep them. */"
-    )
+    lines.append("/* Payloads as on the wire: packed, little endian, which is the byte order of the AVR and of PCs. */")
     for name, _, table in protocol.MESSAGES:
         lines.append(f"struct __attribute__((packed)) {name.lower()} {{")
         for field, ctype in protocol.fields(table):
@@ -48,7 +46,7 @@ def header() -> str:
             lines.append(f"  {ctype.name} {field}{size};")
         lines += ["};", ""]
     lines += [
-        "/* Payload length of a message from the host; -1 where there is no such message. */",
+        "/* Payload length of a message from the host; -1 if there is no such message. */",
         "static inline int16_t protocol_payload_length(uint8_t message) {",
         "  switch (message) {",
     ]

@@ -1,9 +1,9 @@
-"""Mutation test of the firmware: small wrong changes, each of which some native test has to notice.
+"""Mutation test of the firmware: small wrong changes, each of which a native test must detect.
 
-Changed are comparisons, boolean and arithmetic operators, constants (one more, one less), negations, and statements
-(left out), one at a time, in the firmware's own sources. A mutant that no test notices survives: exit code 1. A change
-that makes no difference at all is listed with its reason in tools/mutate_equivalent.txt; one listed there that a test
-does notice, or that no longer exists, is an error too.
+A mutant has one change in the firmware's sources: another comparison, boolean or arithmetic operator, a constant one
+larger or smaller, a removed negation, or a removed statement. A mutant that no test detects survives: exit code 1.
+Changes without any effect are listed in tools/mutate_equivalent.txt, each with its reason; an entry that a test
+detects, or that no longer exists, is an error too.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ COPIED = ("firmware", "tests/firmware", "tools/fuzz")
 SOURCES = ("output.c", "limits.h", "supervisor.c", "frame.c", "sensors.c", "boot.c", "pwm.c")
 TESTS = ("test_output.py", "test_supervisor.py", "test_frame.py", "test_chip.py")
 INSTRUMENT = "INSTRUMENT=-O0 -g0 -fsanitize=undefined -fno-sanitize-recover"
-HANGS_AFTER_S = 10  # of processor time; a whole run of the tests takes 4
+HANGS_AFTER_S = 10  # of processor time; a complete run of the tests takes 4
 
-# What each token may become.
+# Replacements of each token.
 OPERATORS = {
     "<": ("<=", ">="),
     "<=": ("<", ">"),
@@ -64,9 +64,9 @@ OPERATORS = {
 }
 TOKEN = re.compile(r"0x[0-9a-fA-F]+|\w+|->|\+\+|--|<<|>>|&&|\|\||[<>=!+\-*/|&^%]=|[^\s\w]")
 CONSTANT = re.compile(r"(0x[0-9a-fA-F]+|[0-9]+)([UL]*)$")
-# A statement that can be left out: a whole line that is no declaration.
+# A statement that can be removed: a complete line that is no declaration.
 STATEMENT = re.compile(r"\s*((break|continue|return);|[\w>\-.\[\]]+(\+\+|--|\s*[|&+\-]?=\s.*)?;|[\w]+\(.*\);)")
-# Where an operator's sign means something else: pointers, addresses, casts.
+# Places where the sign of an operator has another meaning: pointers, addresses, casts.
 POINTER = re.compile(r"\b(struct \w+|uint8_t|void|int16_t) \*|\*(?=[a-z]\w*(\+\+|,|\)| =|;))|(?<=[(, ])&(?=[a-z])")
 UNTOUCHED = re.compile(r"\s*(#(include|if|else|endif|error|define \w+$)|_Static_assert|/?\*|extern|static_assert|//)")
 
@@ -82,13 +82,13 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        """As in the list of equivalents, which must outlive a change of line numbers."""
+        """The entry in the list of equivalent mutants; it has no line number, because these change."""
         before, after = (code.rstrip("\\ ").strip() for code in (self.before, self.after))
-        return f"{self.source}: {before} -> {after or '(left out)'}"
+        return f"{self.source}: {before} -> {after or '(removed)'}"
 
 
 def _without_comments(text: str) -> str:
-    """Comments become spaces, so that columns stay."""
+    """Replace comments by spaces, so that columns stay the same."""
     blank = lambda match: re.sub(r"[^\n]", " ", match[0])  # noqa: E731
     return re.sub(r"/\*.*?\*/|//[^\n]*|\"[^\"\n]*\"", blank, text, flags=re.DOTALL)
 
@@ -109,8 +109,8 @@ def _changes(code: str) -> Iterator[tuple[int, int, str]]:
 
 
 def mutants() -> list[Mutant]:
-    """All of them, in the order of the sources."""
-    found = {}
+    """Return all mutants, in the order of the sources."""
+    mutant_of = {}
     for source in SOURCES:
         text = _without_comments((ROOT / "firmware" / source).read_text())
         for number, code in enumerate(text.splitlines()):
@@ -121,12 +121,12 @@ def mutants() -> list[Mutant]:
                 changed.append("")
             for after in changed:
                 mutant = Mutant(source, number, code, after)
-                found.setdefault((mutant.name, number), mutant)
-    return list(found.values())
+                mutant_of.setdefault((mutant.name, number), mutant)
+    return list(mutant_of.values())
 
 
 def equivalents() -> dict[str, str]:
-    """Name to reason."""
+    """Return the reason of each equivalent mutant by its name."""
     listed: dict[str, str] = {}
     name = ""
     for line in EQUIVALENT.read_text().splitlines():
@@ -139,7 +139,7 @@ def equivalents() -> dict[str, str]:
 
 
 def _build(folder: Path, mutant: Mutant | None, originals: dict[str, str]) -> bool:
-    """Put the mutant in place and compile; False where it does not."""
+    """Write the mutant (None: the original) and compile; False if that fails."""
     for source, text in originals.items():
         if mutant is not None and source == mutant.source:
             lines = text.splitlines()
@@ -148,46 +148,46 @@ def _build(folder: Path, mutant: Mutant | None, originals: dict[str, str]) -> bo
         if (copy := folder / "firmware" / source).read_text() != text:
             copy.write_text(text)
     command = ["make", "-s", "-C", str(folder / "firmware"), "libraries", f"OUT={folder / 'built'}", INSTRUMENT]
-    command.append("WARNINGS=-w")  # a mutant may well have a variable that nothing uses
+    command.append("WARNINGS=-w")  # a mutant may have an unused variable
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 class Mutation:
-    """A pytest plugin: runs the collected tests once for each mutant, in a fork that ends with the first failure."""
+    """A pytest plugin: runs the collected tests once for each mutant, in a fork that ends at the first failure."""
 
     def __init__(self, folder: Path, chosen: list[Mutant], listed: dict[str, str]) -> None:
         self.folder = folder
         self.chosen = chosen
         self.listed = listed
         self.survivors: list[Mutant] = []
-        self.noticed_though_listed: list[Mutant] = []
+        self.detected_though_listed: list[Mutant] = []
         self.uncompiled = 0
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         items = list(session.items)
         originals = {source: (ROOT / "firmware" / source).read_text() for source in SOURCES}
         assert _build(self.folder, None, originals), "the firmware does not compile"
-        assert self._noticed_by(items) is None, "the tests fail on the firmware as it is"
+        assert self._detected_by(items) is None, "the tests fail on the firmware as it is"
         started = time.monotonic()
         for number, mutant in enumerate(self.chosen):
             if not _build(self.folder, mutant, originals):
                 self.uncompiled += 1
                 continue
-            noticed = self._noticed_by(items)
-            if noticed is None and mutant.name not in self.listed:
+            detected = self._detected_by(items)
+            if detected is None and mutant.name not in self.listed:
                 self.survivors.append(mutant)
                 print(f"\nsurvives: {mutant.source}:{mutant.line + 1}: {mutant.name}", flush=True)
-            elif noticed is not None:
+            elif detected is not None:
                 if mutant.name in self.listed:
-                    self.noticed_though_listed.append(mutant)
-                items.insert(0, items.pop(noticed))  # what noticed this one may well notice the next
+                    self.detected_though_listed.append(mutant)
+                items.insert(0, items.pop(detected))  # the test that detects this mutant is likely to detect the next
             if sys.stderr.isatty() or number % 20 == 19:
                 print(f"\r{number + 1}/{len(self.chosen)} {time.monotonic() - started:.0f} s ", end="", file=sys.stderr)
         return True
 
     @staticmethod
-    def _noticed_by(items: list[pytest.Item]) -> int | None:
-        """The index of the first test that fails, in a process of its own; 0 where the process dies or hangs."""
+    def _detected_by(items: list[pytest.Item]) -> int | None:
+        """Run the tests in a child process; return the index of the first failure, 0 if the process dies or hangs."""
         reading, writing = os.pipe()
         child = os.fork()
         if child == 0:
@@ -205,38 +205,38 @@ class Mutation:
                     os._exit(1)
             os._exit(0)
         os.close(writing)
-        with os.fdopen(reading) as answers:
-            answer = answers.read()
+        with os.fdopen(reading) as pipe:
+            index_text = pipe.read()
         _, status = os.waitpid(child, 0)
-        return int(answer or "0") if status else None
+        return int(index_text or "0") if status else None
 
 
 def _try_all(folder: Path, chosen: list[Mutant], listed: dict[str, str]) -> Mutation:
-    """In a copy of all that is compiled."""
+    """Test the mutants in a copy of the sources."""
     for part in COPIED:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
     os.environ["MODSOFT_NATIVE_FIRMWARE"] = str(folder / "built")
     mutation = Mutation(folder, chosen, listed)
-    options = ["-q", "-s", "--disable-warnings", "--tb=native"]  # quick to write, and nobody reads it
+    options = ["-q", "-s", "--disable-warnings", "--tb=native"]  # the shortest output, which is discarded
     options += [word for plugin in ("cacheprovider", "timeout", "faulthandler") for word in ("-p", f"no:{plugin}")]
-    options += ["-k", "not damaged_and_repeated and not arbitrary"]  # long, and no sharper than the others
+    options += ["-k", "not damaged_and_repeated and not arbitrary"]  # slow, and they detect no more than the others
     code = pytest.main([*options, *(str(ROOT / "tests" / "firmware" / name) for name in TESTS)], plugins=[mutation])
     if code != 0:
-        sys.exit(f"mutate: pytest ended with {code}")
+        sys.exit(f"mutate: pytest failed with exit code {code}")
     return mutation
 
 
 @click.command(help=__doc__)
 @click.option("--every", default=1, show_default=True, help="Try only every n-th mutant.")
-@click.option("--source", type=click.Choice(SOURCES), help="Of this file alone.")
-@click.option("--list", "only_list", is_flag=True, help="Print the mutants, try none.")
+@click.option("--source", type=click.Choice(SOURCES), help="Only mutants of this file.")
+@click.option("--list", "only_list", is_flag=True, help="Print the mutants and exit.")
 def main(every: int, source: str | None, only_list: bool) -> None:
-    """Try the mutants and say which survive."""
-    found, listed = mutants(), equivalents()
-    stale = sorted(set(listed) - {mutant.name for mutant in found})
+    """Test the mutants and report which survive."""
+    all_mutants, listed = mutants(), equivalents()
+    stale = sorted(set(listed) - {mutant.name for mutant in all_mutants})
     if stale:
-        sys.exit(f"mutate: {EQUIVALENT.name} lists what does not exist (any more): {stale[0]}")
-    chosen = [mutant for mutant in found if source in (None, mutant.source)][::every]
+        sys.exit(f"mutate: {EQUIVALENT.name} has an entry without a mutant; correct or delete it: {stale[0]}")
+    chosen = [mutant for mutant in all_mutants if source in (None, mutant.source)][::every]
     if only_list:
         print("\n".join(mutant.name for mutant in chosen))
         return
@@ -244,14 +244,15 @@ def main(every: int, source: str | None, only_list: bool) -> None:
     with tempfile.TemporaryDirectory(prefix="modsoft-mutation-") as folder:
         mutation = _try_all(Path(folder), chosen, listed)
     tried = len(chosen) - mutation.uncompiled
-    spared = sum(mutant.name in listed for mutant in chosen) - len(mutation.noticed_though_listed)
+    equivalent = sum(mutant.name in listed for mutant in chosen) - len(mutation.detected_though_listed)
     print(
         f"{tried} mutants in {time.monotonic() - started:.0f} s ({mutation.uncompiled} more do not compile): "
-        f"{tried - spared - len(mutation.survivors)} noticed, {spared} equivalent, {len(mutation.survivors)} survive"
+        f"{tried - equivalent - len(mutation.survivors)} detected, {equivalent} equivalent, "
+        f"{len(mutation.survivors)} survive"
     )
-    for mutant in mutation.noticed_though_listed:
-        print(f"listed as equivalent, but a test notices it: {mutant.name}")
-    sys.exit(1 if mutation.survivors or mutation.noticed_though_listed else 0)
+    for mutant in mutation.detected_though_listed:
+        print(f"listed as equivalent, but a test detects it: {mutant.name}")
+    sys.exit(1 if mutation.survivors or mutation.detected_though_listed else 0)
 
 
 if __name__ == "__main__":

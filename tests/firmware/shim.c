@@ -1,4 +1,4 @@
-/* What the tests need beside the firmware's own interface: memory for a board, and looks inside. */
+/* Functions for the tests: memory for a board, and access to its state. */
 #include <stdlib.h>
 #include <string.h>
 

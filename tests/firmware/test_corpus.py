@@ -17,7 +17,7 @@ def replay(program):
 def test_no_input_of_the_corpus_breaks_a_rule(native):
     done = replay(native / "replay")
     assert done.returncode == 0, done.stderr
-    assert done.stdout == f"{len(CORPUS)} inputs, no rule broken\n"
+    assert done.stdout == f"{len(CORPUS)} inputs, no rule violated\n"
 
 
 def test_the_corpus_would_notice_outputs_that_are_too_fast(native, tmp_path):

@@ -1,5 +1,5 @@
-/* A test program for the emulated MEGA itself: one command byte sets the chip up so that a test knows what to expect.
- * 115200 baud (double speed). */
+/* A program that tests the emulated MEGA: each command byte brings the chip into a known state. 115200 baud (double
+ * speed). */
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <util/delay.h>
@@ -64,13 +64,13 @@ int main(void) {
       case 't':
         ICR3 = 1999;
         break;
-      case 'i': /* inverting: not what the firmware may do */
+      case 'i': /* inverting, which the firmware must not use */
         TCCR3A |= _BV(COM3B0);
         break;
       case 'x': /* disconnected, pin low */
         TCCR3A &= (uint8_t)~(_BV(COM3B1) | _BV(COM3B0));
         break;
-      case 'p': /* pin high by hand */
+      case 'p': /* pin high by its port register */
         PORTE |= _BV(4);
         break;
       case 'a': {

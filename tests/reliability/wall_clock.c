@@ -1,5 +1,5 @@
-/* Preloaded into a process, makes its wall clock step to and fro by up to an hour, about three times a second; every
- * other clock is left as it is. For row 27 of the failure matrix. */
+/* Preloaded into a process, this changes its wall clock by up to an hour in both directions, about three times a
+ * second; the other clocks stay unchanged. For row 27 of the failure matrix. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <stdint.h>
@@ -14,7 +14,7 @@ static void find(void) {
   }
 }
 
-/* A new one every 300 ms, the same for every caller. */
+/* Changes every 300 ms; the same for every caller. */
 static int64_t offset_s(void) {
   struct timespec now;
   real_gettime(CLOCK_MONOTONIC, &now);

@@ -3,15 +3,15 @@
  * corrupt KIND TRIES [SEED]
  *   flip       1 to 4 bits of a frame
  *   drop       1 to 4 bytes lost
- *   insert     1 to 4 bytes too many
- *   truncate   the end missing; once in 1000 tries followed by 400 ms of silence: the link timer has to vent
- *   garbage    as many bytes of nothing
- *   repeat     whole frames that were good once: sent twice, out of order, of the session before
+ *   insert     1 to 4 bytes inserted
+ *   truncate   the end missing; once in 1000 tries followed by 400 ms of silence: the link timer must vent
+ *   garbage    the same number of random bytes
+ *   repeat     valid frames again: sent twice, out of order, of an earlier session
  *
- * Each try sends a running board one such frame and then a good SET, with new set-points. Prints one JSON object:
- *   tries, whole (arrived as they were sent: only a delimiter was hit), wrong (anything else taken for a frame, or a
- *   repeated one applied), lost (good SETs not applied), silences, latest_vent_ms (after the last good frame).
- * Ends with 1 where wrong or lost is not 0; aborts where a rule of watched.h is broken. */
+ * Each try sends one such frame to a running board, and then a valid SET with new set-points. Prints one JSON object:
+ *   tries, whole (arrived unchanged: only a delimiter was changed), wrong (a corrupted frame accepted, or a repeated
+ *   one applied), lost (valid SETs not applied), silences, latest_vent_ms (after the last valid frame).
+ * Exit code 1 if wrong or lost is not 0; aborts if a rule of watched.h is violated. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -20,8 +20,8 @@
 #include "pins.h"
 #include "watched.h"
 
-#define HISTORY 300   /* sent frames that are kept for being repeated: more than all sequence numbers */
-#define SESSION 20000 /* tries in one; then a new one is armed */
+#define HISTORY 300   /* sent frames kept for repetition: more than there are sequence numbers */
+#define SESSION 20000 /* tries in a session; then a new one is armed */
 #define SILENCE_EVERY 1000
 #define SILENCE_MS 400
 
@@ -47,8 +47,8 @@ static uint32_t draw(uint32_t below) {
   return (uint32_t)((random_state >> 16) % below);
 }
 
-/* Returns the new length; there is room for four more bytes. */
-static uint32_t damage(uint8_t *bytes, uint32_t count, enum kind kind) {
+/* Corrupts a frame in place; returns its new length. The buffer has room for four more bytes. */
+static uint32_t corrupt(uint8_t *bytes, uint32_t count, enum kind kind) {
   uint32_t times = 1 + draw(4);
   if (kind == TRUNCATE) {
     return draw(count);
@@ -75,7 +75,7 @@ static uint32_t damage(uint8_t *bytes, uint32_t count, enum kind kind) {
   return count;
 }
 
-/* A good SET that comes `ahead` after the last one that the board took. */
+/* A valid SET whose sequence number is `ahead` of the last one accepted. */
 static struct sent next_set(uint8_t ahead) {
   struct sent next = {(uint8_t)(host.board.last_seq + ahead), {host.board.set_tick + ahead, {0}}};
   for (uint8_t channel = 0; channel < CHANNELS_USED; channel++) {
@@ -96,14 +96,14 @@ static void send_good(const struct sent *frame) {
   history[sent_count++ % HISTORY] = *frame;
 }
 
-/* The closing delimiter of a damaged frame may be the opening one of the next. */
-static void try_damaged(enum kind kind) {
+/* The closing delimiter of a corrupted frame may be the opening one of the next. */
+static void try_corrupted(enum kind kind) {
   uint8_t bytes[FRAME_MAX_ENCODED + 4];
   struct sent frame = next_set(1);
   const struct supervisor before = host.board;
   uint32_t count = frame_encode(bytes, MESSAGE_SET, frame.seq, host.board.session, &frame.set, sizeof frame.set);
   uint32_t good = 0;
-  count = damage(bytes, count, kind);
+  count = corrupt(bytes, count, kind);
   for (uint32_t i = 0; i < count; i++) {
     good += watched_receive(&host, bytes[i]);
   }
@@ -126,13 +126,13 @@ static void try_repeated(void) {
   uint32_t times = 1 + draw(3);
   struct sent late, early;
   switch (draw(4)) {
-    case 0: /* an earlier one of this session, or the last one, again */
+    case 0: /* an earlier one of this session, or the last one */
       break;
-    case 1: /* of another session, and just what would come next in this one */
+    case 1: /* of another session, with the sequence number that this session expects */
       frame = next_set((uint8_t)(1 + draw(PROTOCOL_SEQUENCE_WINDOW)));
       session = (uint8_t)(session - 1 - draw(255));
       break;
-    case 2: /* two in the wrong order: the first to come is taken, the other is late */
+    case 2: /* two in the wrong order: the first is accepted, the other is late */
       late = next_set(1);
       early = next_set(2);
       send_good(&early);
@@ -157,7 +157,7 @@ static void pass(void) {
   watched_follow(&host, true);
 }
 
-/* Nothing comes any more: the board has to vent by itself. */
+/* The host stops sending: the board must vent by itself. */
 static void silence(void) {
   uint32_t since_ms = host.board.last_valid_ms;
   silences++;
@@ -186,7 +186,7 @@ static void run(enum kind kind, uint64_t tries) {
     if (kind == REPEAT) {
       try_repeated();
     } else {
-      try_damaged(kind);
+      try_corrupted(kind);
     }
     if (kind == TRUNCATE && done % SILENCE_EVERY == SILENCE_EVERY - 1) {
       silence();

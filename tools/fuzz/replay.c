@@ -1,4 +1,4 @@
-/* Runs the fuzzer's target on files, without a fuzzer: replay FILE... . For the tests, and to look into a finding. */
+/* Runs the fuzzer's target on files, without a fuzzer: replay FILE... . For the tests, and to examine a finding. */
 #include <stdint.h>
 #include <stdio.h>
 
@@ -16,6 +16,6 @@ int main(int argc, char **argv) {
     fclose(file);
     LLVMFuzzerTestOneInput(data, size);
   }
-  printf("%d inputs, no rule broken\n", argc - 1);
+  printf("%d inputs, no rule violated\n", argc - 1);
   return 0;
 }

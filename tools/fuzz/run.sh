@@ -1,11 +1,11 @@
 #!/bin/sh
 # Coverage-guided fuzzing of the firmware's parser and supervisor: `make fuzz`, or tools/fuzz/run.sh [SECONDS].
-# Starts from the corpus beside this file; what is found new goes to build/fuzz/corpus, a finding to build/fuzz.
+# Starts from the corpus in this folder; new inputs go to build/fuzz/corpus, findings to build/fuzz.
 set -eu
 cd "$(dirname "$0")/../.."
 seconds=${1:-60}
 
-# Not in tools/install.sh: the compiler is large, and nothing else needs it.
+# Not in tools/install.sh: the compiler is large and has no other use.
 if ! command -v clang >/dev/null 2>&1; then
     set -- clang
 else
@@ -19,7 +19,7 @@ if [ $# -gt 0 ]; then
         apt-get update -qq
         DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
         case $1 in
-        clang) exec "$0" "$seconds" ;; # the library's version is known now
+        clang) exec "$0" "$seconds" ;; # now the version of the library is known
         esac
     else
         echo "fuzz: a Debian package is missing; run: sudo apt-get install $*" >&2

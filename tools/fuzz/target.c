@@ -1,14 +1,14 @@
-/* One input of the fuzzer: a life of the board, written as steps. Every step goes through watched.h, which aborts where
- * a rule is broken; so does, here, a frame from the board that is no good frame.
+/* One input of the fuzzer: a sequence of steps from power-on. Every step goes through watched.h, which aborts if a rule
+ * is violated; so does an invalid frame from the board.
  *
- * A step begins with a byte: its low three bits say what, the others how much or which.
- *   0  so many raw bytes arrive
- *   1  a frame arrives: flags, then its payload (repaired where the flags say so: no fuzzer guesses a hash)
+ * A step begins with a byte: its low three bits select the step, the others are its amount or index.
+ *   0  this many raw bytes arrive
+ *   1  a frame arrives: flags, then its payload (corrected according to the flags: a fuzzer cannot guess a hash)
  *   2  a stall of the loop: one byte, in ms
- *   3  so many passes of 1 ms, sensors following the outputs
+ *   3  this many passes of 1 ms, the sensors follow the outputs
  *   4  a sensor reads: two bytes
- *   5  so many passes of 5 ms, sensors as they are
- *   6  a host that does all right starts a session, which has to succeed from wherever the board is
+ *   5  this many passes of 5 ms, the sensors stay as they are
+ *   6  a correct host starts a session, which must succeed from any state
  *   7  the host reads */
 #include <stddef.h>
 #include <stdio.h>
@@ -19,7 +19,7 @@
 #include "pins.h"
 #include "watched.h"
 
-enum flag { RIGHT_SESSION = 1, RIGHT_SEQUENCE = 2, RIGHT_CONTENT = 4, ONE_BIT_WRONG = 8 };
+enum flag { CORRECT_SESSION = 1, CORRECT_SEQUENCE = 2, CORRECT_CONTENT = 4, ONE_BIT_WRONG = 8 };
 
 static const uint8_t types[] = {MESSAGE_SET,  MESSAGE_HEARTBEAT,   MESSAGE_ARM,    MESSAGE_HELLO_REQ,
                                 MESSAGE_VENT, MESSAGE_CLEAR_FAULT, MESSAGE_STATUS, 0};
@@ -36,8 +36,8 @@ static void take_into(struct input *input, void *to, uint8_t length) {
   }
 }
 
-/* The payload as an honest host would have written it, as far as the board is to be reached at all. */
-static void repair(const struct supervisor *board, uint8_t type, uint8_t *payload) {
+/* Corrects the fields that the board would refuse. */
+static void correct_payload(const struct supervisor *board, uint8_t type, uint8_t *payload) {
   struct set *set = (struct set *)payload;
   struct arm *arm = (struct arm *)payload;
   switch (type) {
@@ -71,10 +71,10 @@ static void frame(struct watched *w, struct input *input, uint8_t which) {
   uint8_t payload[32], bytes[FRAME_MAX_ENCODED], count;
   uint8_t seq = (uint8_t)(w->board.last_seq + 1 + (flags >> 4)), session = w->board.session;
   take_into(input, payload, sizeof payload < length ? sizeof payload : length);
-  seq = flags & RIGHT_SEQUENCE ? seq : take(input);
-  session = flags & RIGHT_SESSION ? session : take(input);
-  if (flags & RIGHT_CONTENT) {
-    repair(&w->board, type, payload);
+  seq = flags & CORRECT_SEQUENCE ? seq : take(input);
+  session = flags & CORRECT_SESSION ? session : take(input);
+  if (flags & CORRECT_CONTENT) {
+    correct_payload(&w->board, type, payload);
   }
   count = frame_encode(bytes, type, seq, session, payload, length);
   if (flags & ONE_BIT_WRONG) {
@@ -93,7 +93,7 @@ static void drain(struct watched *w, struct frame_parser *host) {
     if (byte != PROTOCOL_DELIMITER) {
       frame_take(host, (uint8_t)byte);
     } else if (frame_end(host, &seen) == FRAME_BAD) {
-      fprintf(stderr, "the board sends what is no frame\n");
+      fprintf(stderr, "the board sent an invalid frame\n");
       abort();
     }
   }

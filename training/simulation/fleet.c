@@ -1,6 +1,5 @@
 /* Many robots at once: the compiled half of fleet.py. Robots are the lanes of SIMD vectors; the kernel itself is in
- * fleet_kernel.h, and this file compiles it once for each vector width and tells which of them the processor has.
- */
+ * fleet_kernel.h, and this file compiles it once for each vector width and reports which of them the processor has. */
 
 #include <stdint.h>
 
@@ -10,7 +9,7 @@
 
 enum { ACTUATORS = 2 }; /* that act on a module at a time */
 
-/* One kind of robot; what makes its elements unlike stands in the three arrays. fleet.py fills it in, field by field.
+/* One kind of robot; the three arrays hold the differences between its elements. fleet.py fills it in, field by field.
  * Units: the rest length of an element, the time step, and newton; so a velocity is in rest lengths a time step. */
 struct plant {
   int64_t second;        /* 0 or 1: the director that the second actuator is along; the first is along 0 */
@@ -123,7 +122,7 @@ void fleet_advance(int variant, const struct plant *plant, int blocks, int modul
   }
 }
 
-/* rounds * 12 * lanes multiply-adds, whose result keeps the compiler from leaving them out. */
+/* rounds * 12 * lanes multiply-adds; the result is returned so that the compiler does not remove them. */
 double fleet_peak(int variant, long rounds) {
 #if defined(__x86_64__)
   if (variant == 2) {

@@ -253,7 +253,7 @@ INLINE void NAME(kick)(const struct plant *p, double mobility, ELEMENT *e, const
   e->velocity[2] += p->gravity_kick;
 }
 
-/* What one turn of the sweep works on, at the front element k. */
+/* The data of one turn of the sweep, at the front element k. */
 struct NAME(front) {
   const struct plant *plant;
   ELEMENT *elements;
@@ -382,7 +382,7 @@ static void NAME(advance)(const struct plant *p, int block, int modules, int per
   NAME(drift)(elements, e, 0.5);
 }
 
-/* The most that the core can do, for the benchmark: 12 chains of multiply-adds that wait for nobody. */
+/* The core's peak rate, for the benchmark: 12 independent chains of multiply-adds. */
 static double NAME(peak)(long rounds) {
   V x[12], factor = (V){0} + 0.999999;
   for (int i = 0; i < 12; i++) {

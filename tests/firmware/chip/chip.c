@@ -1,4 +1,4 @@
-/* What pwm.c, sensors.c and boot.c touch of the chip and of the Arduino core, as plain memory. */
+/* The parts of the chip and of the Arduino core that pwm.c, sensors.c and boot.c access, as plain memory. */
 #include <avr/io.h>
 #include <avr/wdt.h>
 

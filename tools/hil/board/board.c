@@ -13,7 +13,7 @@
  *   reset | power-cycle                       reset pin; power off and on (RAM lost)
  *   hang [cli]                                the main loop stops until a reset; cli: interrupts are off too
  *   unplug | plug [PATH]                      pull the USB cable (the board keeps its power); back in, under a new name
- *   corrupt-rx|drop-rx|insert-rx P [SEED]     line noise towards the board, probability a byte
+ *   corrupt-rx|drop-rx|insert-rx P [SEED]     line noise towards the board, probability of each byte
  *   corrupt-tx|drop-tx P [SEED]               line noise towards the host
  *   flood MS | seed N                         random bytes at line rate towards the board; seed of the noise
  *   run US BYTES                              --stepped: advance by US microseconds once the host has sent BYTES bytes
@@ -29,13 +29,13 @@
  *   watchdog, reset (cause: power-on, external, watchdog), hang, halted
  *   late       emulated time gave way by late_us
  *   command    line, done: the echo of every command but `adc` and `run`
- *   ran        end of a `run`; from_host, to_host: bytes taken from and given to the host in all
+ *   ran        end of a `run`; from_host, to_host: total bytes from and to the host
  *   stats, summary   times, lateness, share of a core, byte counters; rx_bootloader: bytes that the host wrote while
  *              the board was in reset or in its bootloader; firmware_slept_us: sleep since the last reset;
  *              firmware_max_awake_us: its longest time without sleep (its slowest loop)
  *
- * Known differences from the chip: a new compare value shows at once, not at the end of the PWM period (256 us); a pin
- * whose timer is connected but stopped counts as 0; ADC8..15 are not there; sleep takes no time to wake from.
+ * Known differences from the chip: a new compare value takes effect at once, not at the end of the PWM period (256 us);
+ * a pin whose timer is connected but stopped counts as 0; ADC8..15 do not exist; waking from sleep takes no time.
  *
  * simavr is GPL-3: this file is a test tool and not part of the wheel. */
 #include "mega.h"
@@ -59,7 +59,7 @@ struct board_load board_load;
 avr_t *avr;
 
 static const char *reset_cause;
-static ticks_t held_until; /* in reset; 0: running */
+static ticks_t held_until; /* end of the reset; 0: running */
 static bool chip_was_reset, halted_reported;
 static void (*chip_reset)(avr_t *);
 static ticks_t woken; /* end of the last sleep; 0 before the first */
@@ -78,7 +78,7 @@ static void on_chip_reset(avr_t *chip) {
   }
 }
 
-/* The registers are cleared, so the pins float: a valve is off from here on. The chip stays in reset for a while. */
+/* The registers are cleared, so the pins float: every valve is off from now on. The chip stays in reset for a while. */
 static void enter_reset(const char *cause) {
   reset_cause = cause;
   held_until = avr->cycle + STARTUP_TICKS;
@@ -93,7 +93,7 @@ static void enter_reset(const char *cause) {
 static void leave_reset(void) {
   for (avr_io_t *io = avr->io_port; io; io = io->next) {
     if (!strcmp(io->kind, "watchdog") && !strcmp(reset_cause, "watchdog")) {
-      avr_watchdog_t *watchdog = (avr_watchdog_t *)io; /* it stays armed over the reset it caused */
+      avr_watchdog_t *watchdog = (avr_watchdog_t *)io; /* it stays on after the reset that it caused */
       watchdog->reset_context.wdrf = 1;
       watchdog->reset_context.avr_run = avr->run;
     }
@@ -105,9 +105,9 @@ static void leave_reset(void) {
     avr->data[MCUSR] |= 1 << PORF;
   }
   for (int i = 0; i < EXTINT_COUNT; i++) {
-    avr_extint_set_strict_lvl_trig(avr, i, 0); /* else the low pins are polled in every cycle: 0.35x real time */
+    avr_extint_set_strict_lvl_trig(avr, i, 0); /* otherwise simavr polls the low pins in every cycle: 0.35x real time */
   }
-  avr->run_cycle_limit = TICKS_PER_SECOND / 1000; /* run on until the next timer instead of one instruction a call */
+  avr->run_cycle_limit = TICKS_PER_SECOND / 1000; /* run until the next timer instead of one instruction a call */
   uart_after_reset();
   held_until = woken = board_load.slept = 0;
   chip_was_reset = halted_reported = false;
@@ -120,8 +120,7 @@ void board_reset_pin(void) {
 
 void board_power_cycle(void) {
   avr_reset(avr);
-  for (unsigned address = 0; address <= avr->ramend;
-       address++) { /* chance values; every other reset leaves them alone */
+  for (unsigned address = 0; address <= avr->ramend; address++) { /* random values; every other reset keeps them */
     if (address < 32 || address > avr->ioend) {
       avr->data[address] = harness_random();
     }
@@ -131,7 +130,7 @@ void board_power_cycle(void) {
 
 bool board_runs_firmware(void) { return !held_until && !(avr->reset_pc && avr->pc >= avr->reset_pc); }
 
-bool board_hang(bool deaf) {
+bool board_hang(bool interrupts_off) {
   if (hang.on || !board_runs_firmware()) {
     return false; /* the bootloader has no watchdog */
   }
@@ -140,16 +139,16 @@ bool board_hang(bool deaf) {
   memcpy(hang.before, avr->flash + hang.at, 2);
   avr->flash[hang.at] = RJMP_SELF & 0xFF;
   avr->flash[hang.at + 1] = RJMP_SELF >> 8;
-  if (deaf) {
+  if (interrupts_off) {
     avr->sreg[S_I] = 0;
   }
-  events_emit("hang", "\"pc\":%u,\"interrupts\":%s", (unsigned)avr->pc, deaf ? "false" : "true");
+  events_emit("hang", "\"pc\":%u,\"interrupts\":%s", (unsigned)avr->pc, interrupts_off ? "false" : "true");
   return true;
 }
 
 static avr_cycle_count_t on_slice_end(avr_t *chip, avr_cycle_count_t when, void *param) {
   (void)chip, (void)when, (void)param;
-  return 0; /* it is only there so that a sleeping chip does not sleep past it */
+  return 0; /* exists only so that a sleeping chip wakes at the end of the slice */
 }
 
 void board_run(ticks_t until) {
@@ -168,7 +167,7 @@ void board_run(ticks_t until) {
     if (chip_was_reset) {
       enter_reset("watchdog");
     }
-    if (avr->state == cpu_Done || avr->state == cpu_Crashed) { /* asleep with interrupts off, or lost: time goes on */
+    if (avr->state == cpu_Done || avr->state == cpu_Crashed) { /* asleep with interrupts off, or crashed: time passes */
       if (!halted_reported) {
         events_emit("halted", "\"pc\":%u,\"crashed\":%s", (unsigned)avr->pc,
                     avr->state == cpu_Crashed ? "true" : "false");
@@ -191,7 +190,7 @@ static uint32_t load_hex(const char *path) {
   ihex_chunk_p chunks = NULL;
   int count = read_ihex_chunks(path, &chunks);
   if (count <= 0) {
-    events_fail(EXIT_USAGE, "%s is not an Intel hex file that can be read", path);
+    events_fail(EXIT_USAGE, "%s is not a readable Intel hex file", path);
   }
   for (int i = 0; i < count; i++) {
     avr_loadcode(avr, chunks[i].data, chunks[i].size, chunks[i].baseaddr);
@@ -205,7 +204,7 @@ static void load_firmware(const char *path) {
   if (suffix && !strcasecmp(suffix, ".hex")) {
     load_hex(path);
   } else if (elf_read_firmware(path, &firmware) != 0 || !firmware.flashsize) {
-    events_fail(EXIT_USAGE, "%s is not a firmware ELF file that can be read", path);
+    events_fail(EXIT_USAGE, "%s is not a readable ELF file of a firmware", path);
   } else {
     avr_loadcode(avr, firmware.flash, firmware.flashsize, firmware.flashbase);
   }
@@ -218,7 +217,7 @@ static void log_to_stderr(avr_t *chip, const int level, const char *format, va_l
   }
 }
 
-/* The firmware sleeps until the next timer of the emulated chip; real time passes elsewhere, slice by slice. */
+/* The firmware sleeps until the next timer of the emulated chip; the harness waits for real time after each slice. */
 static void on_sleep(avr_t *chip, avr_cycle_count_t cycles) {
   ticks_t awake = chip->cycle - woken;
   if (woken && awake > board_load.max_awake) {

@@ -1,4 +1,4 @@
-/* The valve outputs of the emulated MEGA: what each channel's pin really does, read from the timer registers. */
+/* The valve outputs of the emulated MEGA: the output of each channel's pin, computed from the timer registers. */
 #include "mega.h"
 
 #include "pins.h"
@@ -41,14 +41,14 @@ static void sample(unsigned channel) {
   bool level = avr->data[outputs[o].port] >> outputs[o].bit & 1;
   double duty = 0;
   if (is_output && com == 0) {
-    duty = level; /* a plain pin: the bootloader's lamp on D13 shows here */
+    duty = level; /* a plain pin: shows the bootloader's LED on D13 */
   } else if (is_output && clock && com == 2 && mode == MODE_14) {
     duty = compare >= top ? 1 : (compare + 1.0) / (top + 1.0);
   } else if (is_output && clock) {
-    duty = 1; /* a mode this harness does not model: the worst case, so that a test sees it */
+    duty = 1; /* a mode that is not modelled: the worst case, so that a test fails */
   }
   if (duty == 0) {
-    compare = top = 0; /* what stands in a disconnected timer drives nothing */
+    compare = top = 0; /* the registers of a disconnected timer have no effect */
   }
   if (duty == last[channel].duty && compare == last[channel].compare && top == last[channel].top) {
     return;

@@ -10,7 +10,7 @@
 static avr_uart_t *uart;
 static avr_irq_t *uart_in;
 static ticks_t tx_free, rx_end;        /* when the last byte is out; when the one arriving is in */
-static int rx_now = -1, rx_shift = -1; /* arriving; arrived, but both places of the receive buffer are taken */
+static int rx_now = -1, rx_shift = -1; /* arriving; arrived, but both places of the receive buffer are full */
 static struct {
   avr_io_read_t read;
   void *param;
@@ -26,16 +26,16 @@ static uint32_t board_bit_ticks(void) {
 
 static uint32_t board_baud(void) { return TICKS_PER_SECOND / board_bit_ticks(); }
 
-/* 0 while the receiver is off: then it does not matter how fast the host sends. */
+/* 0 while the receiver is off: then the host's rate does not matter. */
 static uint32_t listening_baud(void) { return avr->data[UCSR0B] >> RXEN0 & 1 ? board_baud() : 0; }
 
-/* simavr works its byte time out at every change of the rate, so this is done before it is used. */
+/* simavr computes its byte time at every change of the rate, so this corrects it before each use. */
 static void correct_byte_time(void) { uart->cycles_per_byte = BITS_PER_BYTE * board_bit_ticks(); }
 
 static unsigned rx_held(void) { return (uart->input.write - uart->input.read) & (uart_fifo_fifo_size - 1); }
 
 static void rx_store(uint8_t byte) {
-  uart->cycles_per_byte = 1; /* its stop bit has just passed: ready at once, not one byte time later */
+  uart->cycles_per_byte = 1; /* its stop bit has arrived: ready now, not one byte time later */
   avr_raise_irq(uart_in, byte);
   correct_byte_time();
 }
@@ -55,7 +55,7 @@ static avr_cycle_count_t on_rx_byte(avr_t *chip, avr_cycle_count_t when, void *p
     return 0;
   }
   rx_end = when + line_byte_ticks();
-  if (rx_shift >= 0) { /* a new start bit, and the shift register is still taken */
+  if (rx_shift >= 0) { /* a new start bit while the shift register is still full */
     line_counters.rx_overrun++;
     rx_shift = -1;
   }
@@ -64,14 +64,14 @@ static avr_cycle_count_t on_rx_byte(avr_t *chip, avr_cycle_count_t when, void *p
 
 static uint8_t on_udr_read(avr_t *chip, avr_io_addr_t address, void *param) {
   (void)param;
-  uart->rx_cnt = 0; /* simavr's own limit on the reading rate is not needed: bytes come at line rate */
+  uart->rx_cnt = 0; /* disables simavr's limit of the reading rate: bytes arrive at line rate */
   uint8_t value = chip_udr.read(chip, address, chip_udr.param);
   if (rx_shift >= 0) {
     rx_store((uint8_t)rx_shift);
     rx_shift = -1;
   }
   if (rx_held()) {
-    avr_raise_interrupt(chip, &uart->rxc); /* the flag stays up while a byte is left */
+    avr_raise_interrupt(chip, &uart->rxc); /* the flag stays set while a byte is left */
   }
   return value;
 }
@@ -131,7 +131,7 @@ void uart_begin(void) {
       uart = (avr_uart_t *)io;
     }
   }
-  uint32_t no_flags = 0; /* simavr would sleep a while at every look at the status register */
+  uint32_t no_flags = 0; /* otherwise simavr sleeps at every read of the status register */
   avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &no_flags);
   uart_in = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
   avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_uart_output, NULL);

@@ -1,4 +1,4 @@
-/* What the emulated boards say: events as JSON lines on standard output, and a last word on standard error. */
+/* Output of the emulated boards: events as JSON lines on standard output, fatal errors as a line on standard error. */
 #define _GNU_SOURCE
 #include "harness.h"
 
@@ -26,7 +26,7 @@ uint64_t events_mono_ns(void) {
 
 void events_begin(void) {
   events_fd = fcntl(1, F_DUPFD_CLOEXEC, 3);
-  dup2(2, 1); /* libraries print there; the events keep standard output for themselves */
+  dup2(2, 1); /* libraries print to standard error; standard output has only events */
   fcntl(events_fd, F_SETFL, fcntl(events_fd, F_GETFL) | O_NONBLOCK);
 }
 
@@ -52,7 +52,7 @@ void events_flush(bool wait) {
     } else if (errno == EAGAIN) {
       break;
     } else if (errno != EINTR) {
-      exit(0); /* nobody is left to report to */
+      exit(0); /* the reader has closed the pipe */
     }
   }
   memmove(pending, pending + done, pending_size -= done);
@@ -75,7 +75,7 @@ void events_emit(const char *name, const char *format, ...) {
   line[size++] = '}';
   line[size++] = '\n';
   if (pending_size + size > EVENT_BACKLOG) {
-    events_fail(EXIT_INTERNAL, "nobody reads the events: %zu bytes are waiting", pending_size);
+    events_fail(EXIT_INTERNAL, "no process reads the events: %zu bytes are waiting", pending_size);
   }
   if (pending_size + size > pending_room) {
     pending = realloc(pending, pending_room = 2 * pending_room + sizeof line);

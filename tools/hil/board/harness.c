@@ -1,4 +1,4 @@
-/* main() of both emulated boards: commands in, events out, emulated time held to real time. See the top of board.c. */
+/* main() of both emulated boards: commands, events, pacing of the emulated time. See the top of board.c. */
 #define _GNU_SOURCE
 #include "harness.h"
 
@@ -17,15 +17,15 @@
 #include "pins.h"
 
 #define SLICE_US 500
-#define LATE_US 1000        /* a slice later than this is counted */
-#define LATE_BOUND_US 20000 /* later than this, emulated time gives way instead of running after real time */
-#define STEP_WAIT_US 50     /* for the bytes that a pseudo terminal still holds */
+#define LATE_US 1000        /* slices later than this are counted */
+#define LATE_BOUND_US 20000 /* beyond this, emulated time drops the delay */
+#define STEP_WAIT_US 50     /* for bytes that are still in the pseudo terminal */
 #define STEP_TRIES 20000
 
 static uint64_t started_ns, slices, late_slices, max_late_ns, slipped_ns, pwm_events, resets;
-static ticks_t run_until;      /* stepped: emulated time stands still from here on */
-static uint64_t run_from_host; /* ... and does not start before so many bytes came from the host */
-static bool run_told = true;
+static ticks_t run_until;      /* stepped: end of the emulated time that `run` allows */
+static uint64_t run_from_host; /* ... which starts once the host has sent this many bytes */
+static bool run_reported = true;
 static volatile sig_atomic_t stop_signal;
 static uint64_t random_state = 0x9E3779B97F4A7C15u;
 
@@ -107,8 +107,8 @@ static bool run_command(char *line) {
   } else if (!strcmp(verb, "run") && numbers == 2 && a > 0) {
     run_until = board_now() + (ticks_t)(a * TICKS_PER_US);
     run_from_host = (uint64_t)b;
-    run_told = false;
-    return true; /* a host sends hundreds a second: told when it is done */
+    run_reported = false;
+    return true; /* a host sends hundreds a second: no event until it ends */
   } else {
     known = numbers >= 1 && a >= 0 && a <= 1 && line_command(verb, a);
     if (known && numbers >= 2) {
@@ -132,7 +132,7 @@ static void read_commands(int wait_ms) {
   }
   ssize_t got = read(0, buffer + size, sizeof buffer - 1 - size);
   if (got <= 0) {
-    stop_signal = SIGTERM; /* end of file: whoever started this board is gone */
+    stop_signal = SIGTERM; /* end of file: the parent has ended */
     return;
   }
   size += (size_t)got;
@@ -171,14 +171,14 @@ static void pace(uint64_t *base_ns, ticks_t slice_end) {
   }
 }
 
-/* Stepped: waits until there is time to run for; what the host wrote before it gave that time has come in by then. */
+/* Stepped: waits for a `run`, then for the bytes that the host wrote before it. */
 static void await_step(void) {
   while (board_now() >= run_until && !stop_signal) {
-    if (!run_told) {
+    if (!run_reported) {
       events_emit("ran", "\"from_host\":%llu,\"to_host\":%llu", (unsigned long long)line_counters.from_host,
                   (unsigned long long)line_counters.to_host);
     }
-    run_told = true;
+    run_reported = true;
     events_flush(true);
     read_commands(1000);
   }

@@ -1,4 +1,4 @@
-/* What the two emulated boards share, and what each of them has to give.
+/* Shared by the two emulated boards, with the functions that each of them must define.
  *
  * board.c (the compiled firmware on simavr) and native_board.c (the firmware's logic compiled for this machine) define
  * the board_* functions; line.c (serial line as a pseudo terminal), sensors.c, events.c and harness.c (main,
@@ -22,11 +22,11 @@ typedef uint64_t ticks_t;
 #define MAX_CHANNELS 16
 
 struct options {
-  const char *firmware;   /* ELF or Intel hex; the native board has its own compiled in */
+  const char *firmware;   /* ELF or Intel hex; the native board is compiled with its own */
   const char *bootloader; /* Intel hex, or NULL: the reset vector is then the firmware's */
   const char *port_link;  /* symbolic link to be made to the serial port */
-  bool fast;              /* do not hold emulated time to real time */
-  bool stepped;           /* emulated time stands still but for the command `run` */
+  bool fast;              /* emulated time does not follow real time */
+  bool stepped;           /* emulated time advances only in the command `run` */
 };
 
 /* --- a board ----------------------------------------------------------------------------------------------------- */
@@ -42,25 +42,24 @@ extern struct board_load board_load;
 
 void board_power_on(const struct options *options);
 ticks_t board_now(void);
-void board_run(ticks_t until);  /* may overshoot by one instruction */
-void board_reset_pin(void);     /* what DTR does when the port is opened */
-void board_power_cycle(void);   /* a reset that also loses the RAM */
-bool board_runs_firmware(void); /* false: in reset, or in the bootloader */
-bool board_hang(
-    bool deaf); /* no progress in the main loop until the next reset, interrupts off too if deaf; false: not now */
+void board_run(ticks_t until);        /* may overshoot by one instruction */
+void board_reset_pin(void);           /* what DTR does when the port is opened */
+void board_power_cycle(void);         /* a reset that also loses the RAM */
+bool board_runs_firmware(void);       /* false: in reset, or in the bootloader */
+bool board_hang(bool interrupts_off); /* stops the main loop until the next reset; false: not possible now */
 void board_set_adc(unsigned input, unsigned millivolt);
 
 /* --- the serial line (line.c) ------------------------------------------------------------------------------------ */
 
 struct line_counters {
   uint64_t rx, tx;                   /* bytes that the board received, sent */
-  uint64_t rx_bootloader;            /* that the host wrote while the board was in reset or in its bootloader */
-  uint64_t rx_corrupted, rx_dropped; /* by the injected noise */
+  uint64_t rx_bootloader;            /* written by the host while the board was in reset or in its bootloader */
+  uint64_t rx_corrupted, rx_dropped; /* by injected noise */
   uint64_t tx_corrupted, tx_dropped;
   uint64_t rx_overrun;         /* lost in the UART: the firmware was too slow */
-  uint64_t tx_unread;          /* lost because the host did not read */
+  uint64_t tx_unread;          /* lost, because the host did not read */
   uint64_t from_host, to_host; /* taken from and given to the pseudo terminal */
-  uint64_t wrong_baud;         /* garbled: host and board set different rates */
+  uint64_t wrong_baud;         /* corrupted: host and board use different rates */
 };
 extern struct line_counters line_counters;
 
@@ -71,8 +70,8 @@ const char *line_port(void);
 bool line_is_open(void);                 /* a host has it open */
 void line_poll(void);                    /* once a slice: opened or closed, bytes in */
 void line_flush(ticks_t now);            /* once a slice: bytes out whose stop bit has passed */
-int line_next_byte(uint32_t board_baud); /* the byte that starts to arrive now, or -1; 0: nobody listens */
-ticks_t line_byte_ticks(void);           /* how long it takes to arrive, at the host's rate */
+int line_next_byte(uint32_t board_baud); /* the byte that starts to arrive now, or -1; baud 0: the receiver is off */
+ticks_t line_byte_ticks(void);           /* duration of a byte at the host's rate */
 void line_send(ticks_t end, uint8_t byte, uint32_t board_baud);
 bool line_command(const char *verb, double probability);
 void line_flood(ticks_t duration);

@@ -19,7 +19,7 @@
 #include <unistd.h>
 
 #define BITS_PER_BYTE 10 /* start, eight data, stop */
-#define RX_ROOM 512      /* like the USB chip's buffer: when it is full the host's write() waits */
+#define RX_ROOM 512      /* like the USB chip's buffer: the host's write() waits while it is full */
 #define TX_ROOM 4096
 #define BAUD_TOLERANCE 0.04
 
@@ -47,7 +47,7 @@ static void make_link(const char *link) {
   struct stat there;
   snprintf(link_name, sizeof link_name, "%s", link);
   if (lstat(link_name, &there) == 0 && S_ISLNK(there.st_mode)) {
-    unlink(link_name); /* left behind by a board that was killed; anything else is not ours to remove */
+    unlink(link_name); /* left by a board that was killed; nothing else is removed */
   }
   if (symlink(slave_name, link_name) != 0) {
     events_fail(EXIT_USAGE, "cannot make the port link %s: %s", link_name, strerror(errno));
@@ -80,7 +80,7 @@ void line_unplug(void) {
     return;
   }
   unlink(link_name);
-  close(master); /* the host's next read fails, as with a USB cable that was pulled */
+  close(master); /* the host's next read fails, as with an unplugged USB cable */
   master = -1;
   rx_count = tx_count = 0;
   if (host_open) {
@@ -102,7 +102,7 @@ const char *line_port(void) { return slave_name; }
 
 bool line_is_open(void) { return host_open; }
 
-/* The host's termios, seen from the master. Rate 0 is how a host drops DTR with termios alone. */
+/* Reads the host's termios at the master. Rate 0 is how a host drops DTR with termios alone. */
 static void poll_baud(void) {
   struct termios2 host;
   if (ioctl(master, TCGETS2, &host) != 0) {
@@ -156,7 +156,7 @@ void line_poll(void) {
       rx[(rx_first + rx_count++) % RX_ROOM] = bytes[i];
     }
   }
-  if (!open_now && host_open) { /* after the read: what was written before the close still arrives */
+  if (!open_now && host_open) { /* after the read: bytes written before the close still arrive */
     host_open = false;
     events_emit("uart-close", "\"unplugged\":false");
   }

@@ -1,8 +1,8 @@
-/* The second board: the firmware's own logic (frame.c, output.c, supervisor.c) compiled for this machine.
+/* The native board: the firmware's logic (frame.c, output.c, supervisor.c) compiled for this machine.
  *
- * For machines without simavr. Same commands and events as board.c, same pacing, same serial line; but firmware.ino and
- * everything below it is replaced by this file: no bootloader, no timer registers (duties are what the logic asks for),
- * no AVR compiler, no timing of the CPU. What it shows is the protocol, the states and the safety timers, no more. */
+ * For machines without simavr. Same commands, events, pacing and serial line as board.c, but this file replaces
+ * firmware.ino and the hardware below it: no bootloader, no timer registers (duties are those of the logic), no AVR
+ * compiler, no timing of the CPU. It tests the protocol, the states and the safety timers only. */
 #include "harness.h"
 
 #include <string.h>
@@ -124,8 +124,8 @@ void board_power_on(const struct options *options) {
 
 bool board_runs_firmware(void) { return now >= started; }
 
-bool board_hang(bool deaf) {
-  (void)deaf; /* there are no interrupts here */
+bool board_hang(bool interrupts_off) {
+  (void)interrupts_off; /* there are no interrupts here */
   hung = true;
   events_emit("hang", "%s", "");
   return true;

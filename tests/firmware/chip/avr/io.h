@@ -1,4 +1,4 @@
-/* In place of avr-libc's <avr/io.h>, for the native build: its own names of registers and bits, over plain memory. */
+/* Replaces avr-libc's <avr/io.h> in the native build: the same names of registers and bits, in plain memory. */
 #ifndef FAKE_AVR_IO_H
 #define FAKE_AVR_IO_H
 

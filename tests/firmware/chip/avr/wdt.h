@@ -1,4 +1,4 @@
-/* In place of avr-libc's <avr/wdt.h>: the watchdog is two variables in chip.c. */
+/* Replaces avr-libc's <avr/wdt.h>: the watchdog is two variables in chip.c. */
 #ifndef FAKE_AVR_WDT_H
 #define FAKE_AVR_WDT_H
 

@@ -1,2 +1,2 @@
-/* In place of avr-libc's <util/atomic.h>: nothing interrupts here. */
+/* Replaces avr-libc's <util/atomic.h>: there are no interrupts here. */
 #define ATOMIC_BLOCK(type)
