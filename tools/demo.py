@@ -128,8 +128,8 @@ def summary(report: dict[str, Any]) -> list[str]:
             values = f"median {spread['p50']:.1f}, 99 % {spread['p99']:.1f}, largest {spread['max']:.1f} ms"
             lines.append(f"  {name:<27} {values}")
     lines.append(f"  missed ticks, held ticks    {figures['missed_ticks']}, {figures['held_ticks']}")
-    verdict = ": ".join(filter(None, (report["verdict"], report["reason"])))
-    lines.append(f"  verdict                     {verdict}")
+    outcome = ": ".join(filter(None, (report["outcome"], report["reason"])))
+    lines.append(f"  outcome                     {outcome}")
     return lines
 
 

@@ -8,7 +8,7 @@ from modsoft.runtime.errors import InUse, OutputError, UsageError
 
 
 class Interrupted:
-    """A rig that ends with Ctrl-C after it has written all that a rig writes."""
+    """A rig that is interrupted by Ctrl-C after it has written its files."""
 
     def __init__(self, robot_file, folder, board):
         self.folder, self.runs = folder, folder / "runtime-log-1"
@@ -20,7 +20,7 @@ class Interrupted:
     def __exit__(self, *error):
         pass
 
-    def run(self, *order):
+    def run(self, *options):
         (self.runs / "1-down").mkdir(parents=True)
         for name in ("run.jsonl", "meta.json"):
             (self.runs / "1-down" / name).write_text("new")
@@ -33,14 +33,14 @@ class Interrupted:
 
 
 @pytest.fixture
-def order(tmp_path, model_file, monkeypatch):
-    """order() runs the command into tmp_path / "out"; the rig that it starts is interrupted."""
+def run_command(tmp_path, model_file, monkeypatch):
+    """run_command() runs the command with --report tmp_path / "out"; its rig is interrupted."""
     monkeypatch.setattr(rig, "Rig", Interrupted)
 
     def run():
         arguments = {"--robot": "pneumatic-3", "--model": model_file, "--task": "down", "--report": tmp_path / "out"}
-        told = [str(part) for pair in [*arguments.items(), ("--board", "native")] for part in pair]
-        return cli.cli.main(told, standalone_mode=False)
+        options = [str(part) for pair in [*arguments.items(), ("--board", "native")] for part in pair]
+        return cli.cli.main(options, standalone_mode=False)
 
     return run
 
@@ -60,21 +60,21 @@ def texts(folder):
         ([".modsoft-hil", "run.jsonl"], "give a new or empty folder"),
     ],
 )
-def test_files_of_others_and_finished_reports_are_never_replaced(files, says, tmp_path, order):
+def test_other_files_and_finished_reports_are_kept(files, says, tmp_path, run_command):
     before = {name: "old" for name in files}
     for name in files:
         (tmp_path / "out" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "out" / name).write_text("old")
     with pytest.raises(UsageError, match=says):
-        order()
+        run_command()
     assert texts(tmp_path / "out") == before
 
 
-def test_an_interrupted_run_leaves_its_traces_and_the_next_one_replaces_them(tmp_path, order):
-    """And nothing else that is in the folder."""
+def test_next_run_replaces_the_traces_of_an_interrupted_one(tmp_path, run_command):
+    """Other files of the folder are kept."""
     for _ in range(2):
         with pytest.raises((KeyboardInterrupt, click.Abort)):
-            order()
+            run_command()
         own = {name: "new" for name in ("board.jsonl", "run.jsonl", "meta.json")}
         own[".modsoft-hil"] = report_folder.MARKER_TEXT
         assert texts(tmp_path / "out") == own
@@ -84,23 +84,23 @@ def test_an_interrupted_run_leaves_its_traces_and_the_next_one_replaces_them(tmp
         (tmp_path / "out" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "out" / name).write_text("mine")
     with pytest.raises((KeyboardInterrupt, click.Abort)):
-        order()
+        run_command()
     assert texts(tmp_path / "out") == {**own, "mine.txt": "mine", "runs/1-down/run.jsonl": "mine"}
 
 
-def test_two_runs_do_not_share_a_folder(tmp_path, order):
+def test_two_runs_do_not_share_a_folder(tmp_path, run_command):
     with report_folder.claimed(tmp_path / "out"), pytest.raises(InUse, match="another modsoft-hil works on it"):
-        order()
+        run_command()
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path, order):
+def test_folder_that_cannot_be_made_is_refused(tmp_path, run_command):
     (tmp_path / "out").symlink_to("/proc/none")
     with pytest.raises(OutputError, match="out: no such folder can be made"):
-        order()
+        run_command()
 
 
-def test_the_help_says_what_becomes_of_the_folder(capsys):
+def test_help_describes_the_folder(capsys):
     cli.cli.main(["--help"], standalone_mode=False)
-    told = " ".join(capsys.readouterr().out.split())
-    assert "one that holds a report already is refused" in told
-    assert "interrupted leaves its traces there and no report; the next one into the folder replaces them" in told
+    text = " ".join(capsys.readouterr().out.split())
+    assert "a folder with a report is refused" in text
+    assert "interrupted run leaves its traces there and no report; the next run into this folder replaces them" in text

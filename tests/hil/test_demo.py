@@ -153,7 +153,7 @@ def test_summary_has_the_figures_of_the_run(demo):
         "acknowledged_ms": None,
         "tracking_error_deg": {"mean": [0.5, 1.25], "std": [0.1, 0.2]},
     }
-    report = {"figures": figures, "about": {"board": "a board"}, "verdict": "failed", "reason": "held ticks 1"}
+    report = {"figures": figures, "about": {"board": "a board"}, "outcome": "failed", "reason": "held ticks 1"}
     text = "\n".join(demo.summary(report))
     assert "module 2  1.25° ± 0.20°" in text
     assert "median 0.2, 99 % 1.5, largest 2.0 ms" in text

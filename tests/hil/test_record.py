@@ -64,9 +64,9 @@ def test_a_first_tick_that_sent_nothing_is_a_failed_run_with_a_report(run_folder
     np.testing.assert_array_equal(found.commanded_bar[:, 5:7], [[0.08, 0], [0.2, 0]])
     assert found.missed == 1
     assert found.runtime_said == "too late"
-    verdict = criteria.judge(found)
-    assert verdict.word == "failed"
-    report.write(found, verdict, {"board": "native"}, tmp_path)
+    assessment = criteria.assess(found)
+    assert assessment.outcome == "failed"
+    report.write(found, assessment, {"board": "native"}, tmp_path)
     assert "too late" in (tmp_path / "report.md").read_text()
 
 
@@ -74,7 +74,7 @@ def test_a_run_without_a_first_set_point_has_none(run_folder):
     found = run_folder(start=False)
     assert found.start_ns is None
     assert not found.commanded_bar[0].any()
-    assert criteria.judge(found).word == "failed"
+    assert criteria.assess(found).outcome == "failed"
 
 
 @pytest.mark.parametrize(("board", "expected"), [(5000, 0.5), (20000, 2.0), (30000, 2.0), (None, 2.0)])

@@ -1,4 +1,4 @@
-"""The report: what is written can be read again, says what was judged, and shows what it says it shows."""
+"""The report: its text, its figures, and its plot."""
 
 import json
 from dataclasses import replace
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from modsoft.hil import report
-from modsoft.hil.criteria import judge
+from modsoft.hil.criteria import assess
 from modsoft.hil.outputs import ValveOutputs
 from modsoft.hil.record import Record
 from modsoft.runtime import robot as robots
@@ -57,17 +57,17 @@ def record():
 
 
 def test_figures_are_of_the_run(record):
-    found = report.figures(record)
-    assert found["tracking_error_deg"]["mean"] == pytest.approx([0.5, 2.0])
-    assert found["tracking_error_percent"]["mean"] == pytest.approx([0.8727, 3.4905], abs=1e-3)  # 2 sin(half angle)
-    assert found["lateness_ms"] == pytest.approx({"p50": 0.55, "p99": 1.0, "max": 1.0}, abs=0.02)
-    assert found["ticks"] == 100
+    figures = report.figures(record)
+    assert figures["tracking_error_deg"]["mean"] == pytest.approx([0.5, 2.0])
+    assert figures["tracking_error_percent"]["mean"] == pytest.approx([0.8727, 3.4905], abs=1e-3)  # 2 sin(half angle)
+    assert figures["lateness_ms"] == pytest.approx({"p50": 0.55, "p99": 1.0, "max": 1.0}, abs=0.02)
+    assert figures["ticks"] == 100
 
 
-def test_the_folder_holds_text_figures_and_picture(record, tmp_path):
-    report.write(record, judge(record), {"board": "simavr", "firmware": "abc"}, tmp_path)
+def test_folder_holds_text_figures_and_plot(record, tmp_path):
+    report.write(record, assess(record), {"board": "simavr", "firmware": "abc"}, tmp_path)
     document = json.loads((tmp_path / "report.json").read_text())
-    assert document["verdict"] == "passed"
+    assert document["outcome"] == "passed"
     assert document["about"] == {"board": "simavr", "firmware": "abc"}
     assert document["figures"]["tracking_error_deg"]["mean"] == pytest.approx([0.5, 2.0])
     text = (tmp_path / "report.md").read_text()
@@ -77,37 +77,37 @@ def test_the_folder_holds_text_figures_and_picture(record, tmp_path):
     assert (tmp_path / "angles.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_picture_that_fails_leaves_the_text(record, tmp_path, monkeypatch):
+def test_failed_plot_keeps_the_text(record, tmp_path, monkeypatch):
     monkeypatch.setattr(report, "picture", lambda record: 1 / 0)
-    trouble = report.write(record, judge(record), {}, tmp_path)
-    assert trouble == "angles.png is missing: division by zero"
+    no_picture = report.write(record, assess(record), {}, tmp_path)
+    assert no_picture == "angles.png is missing: division by zero"
     text = (tmp_path / "report.md").read_text()
-    assert trouble in text
+    assert no_picture in text
     assert "![" not in text
-    assert json.loads((tmp_path / "report.json").read_text())["verdict"] == "passed"
+    assert json.loads((tmp_path / "report.json").read_text())["outcome"] == "passed"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "report.md"]
 
 
-def test_a_run_that_failed_before_its_first_tick_has_a_report_too(record, tmp_path):
+def test_run_without_a_tick_has_a_report(record, tmp_path):
     empty = {
         name: getattr(record, name)[:0]
         for name in "tick mono_ns lateness_ms desired configuration frame_mono_ns commanded_bar acknowledged_ms".split()
     }
     failed = replace(record, **empty, faults=record.faults[:0], state=[], runtime_exit=65, runtime_said="model damaged")
-    report.write(failed, judge(failed), {}, tmp_path)
+    report.write(failed, assess(failed), {}, tmp_path)
     assert "model damaged" in (tmp_path / "report.md").read_text()
     assert "NaN" not in (tmp_path / "report.json").read_text()
     assert not (tmp_path / "angles.png").exists()
 
 
-def test_what_a_slow_host_voids_is_marked(record):
+def test_timing_on_a_slow_host_is_void(record):
     slow = replace(record, board_late_ms=300.0)
-    text = report.text(slow, judge(slow), {}, report.figures(slow))
-    assert "not judged: the host was too slow" in text
+    text = report.text(slow, assess(slow), {}, report.figures(slow))
+    assert "inconclusive: the host was too slow" in text
     assert "| lateness of a tick, 99th percentile | 1.00 ms | below 20 ms | void |" in text
 
 
-def test_the_picture_names_its_units(record):
+def test_plot_names_its_units(record):
     figure = report.picture(record)
     labels = [axes.get_ylabel() + axes.get_xlabel() for axes in figure.axes]
     assert any("°" in label for label in labels)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flawless import COUNTS, flawless_run, slewed, told
+from reference_run import COUNTS, reference_run, slewed, with_output
 
 from modsoft.hil import soak as soaks
 from modsoft.hil.faults import FAULTS, Log
@@ -97,8 +97,8 @@ def test_a_board_that_vents_too_late_or_never_is_found():
 
 
 @pytest.fixture
-def flawless():
-    return flawless_run()
+def reference():
+    return reference_run()
 
 
 def judged(record, stopped_ns=None):
@@ -109,41 +109,41 @@ def judged(record, stopped_ns=None):
 
 def with_counts(record, from_ms, until_ms, counts):
     at_ns = int(record.mono_ns[60])
-    return replace(record, outputs=told(record, at_ns + from_ms * 10**6, at_ns + until_ms * 10**6, counts))
+    return replace(record, outputs=with_output(record, at_ns + from_ms * 10**6, at_ns + until_ms * 10**6, counts))
 
 
-def test_right_valves_pass(flawless):
-    assert judged(flawless) == []
+def test_right_valves_pass(reference):
+    assert judged(reference) == []
 
 
-def test_a_valve_above_or_below_what_was_commanded_is_found_at_any_time(flawless):
-    assert any("above" in word for word in judged(with_counts(flawless, 12, 22, COUNTS // 2)))
-    assert any("below" in word for word in judged(with_counts(flawless, 12, 22, 0)))
-    assert any("off" in word for word in judged(with_counts(flawless, 300, 310, 0)))
+def test_a_valve_above_or_below_what_was_commanded_is_found_at_any_time(reference):
+    assert any("above" in word for word in judged(with_counts(reference, 12, 22, COUNTS // 2)))
+    assert any("below" in word for word in judged(with_counts(reference, 12, 22, 0)))
+    assert any("off" in word for word in judged(with_counts(reference, 300, 310, 0)))
 
 
-def test_a_board_that_vents_by_itself_is_never_wrong_but_one_that_opens_is(flawless):
-    since = int(flawless.mono_ns[60])
-    assert judged(with_counts(flawless, 12, 350, 0), since) == []
-    assert any("above" in word for word in judged(with_counts(flawless, 12, 22, COUNTS // 2), since))
+def test_a_board_that_vents_by_itself_is_never_wrong_but_one_that_opens_is(reference):
+    since = int(reference.mono_ns[60])
+    assert judged(with_counts(reference, 12, 350, 0), since) == []
+    assert any("above" in word for word in judged(with_counts(reference, 12, 22, COUNTS // 2), since))
 
 
-def test_set_points_that_were_not_acknowledged_may_not_have_arrived(flawless):
+def test_set_points_that_were_not_acknowledged_may_not_have_arrived(reference):
     """The registers stay for a tick where they were, and the log says otherwise."""
     k = 60
-    arrived, acknowledged = flawless.commanded_bar.copy(), flawless.acknowledged_ms.copy()
+    arrived, acknowledged = reference.commanded_bar.copy(), reference.acknowledged_ms.copy()
     arrived[k] = arrived[k - 1]
-    stayed = replace(flawless, outputs=slewed(flawless.start_bar, arrived)[0])
+    stayed = replace(reference, outputs=slewed(reference.start_bar, arrived)[0])
     assert any("off" in word for word in judged(stayed))
     acknowledged[k] = np.nan
     assert judged(replace(stayed, acknowledged_ms=acknowledged)) == []
 
 
-def test_a_valve_left_open_and_one_opened_too_early_are_found(flawless):
-    left = flawless.outputs._replace(duty=np.vstack([flawless.outputs.duty[:-1], flawless.outputs.duty[-2:-1]]))
-    assert "a valve was left open" in judged(replace(flawless, outputs=left))
-    early = told(flawless, flawless.start_ns - 2 * 10**9, flawless.start_ns - 10**9, 1)
-    assert "a valve was open before the first set-point" in judged(replace(flawless, outputs=early))
+def test_a_valve_left_open_and_one_opened_too_early_are_found(reference):
+    left = reference.outputs._replace(duty=np.vstack([reference.outputs.duty[:-1], reference.outputs.duty[-2:-1]]))
+    assert "a valve was left open" in judged(replace(reference, outputs=left))
+    early = with_output(reference, reference.start_ns - 2 * 10**9, reference.start_ns - 10**9, 1)
+    assert "a valve was open before the first set-point" in judged(replace(reference, outputs=early))
 
 
 @pytest.mark.parametrize(
@@ -156,10 +156,10 @@ def test_a_valve_left_open_and_one_opened_too_early_are_found(flawless):
         (79, None, True),
     ],
 )
-def test_the_vent_takes_as_long_as_the_ramp_or_the_board_alone(flawless, code, zero_ms, wrong):
+def test_the_vent_takes_as_long_as_the_ramp_or_the_board_alone(reference, code, zero_ms, wrong):
     board = events((9_900, 0.1), *([] if zero_ms is None else [(zero_ms, 0.0)]))
     ran = Ran(1, code=code)
-    judge_vent(ran, replace(flawless, end_ns=10_000 * 10**6, end_us=1e7, outputs=read_outputs(board)))
+    judge_vent(ran, replace(reference, end_ns=10_000 * 10**6, end_us=1e7, outputs=read_outputs(board)))
     assert bool(ran.wrong) == wrong
 
 

@@ -20,8 +20,8 @@ from modsoft.runtime.locks import system_module
 if TYPE_CHECKING:
     from modsoft.hil.rig import Rig
 
-RUN_SLACK_S = 60.0  # start, arming, venting and closing of the runtime, beyond its ticks
-AFTER_S = 1.5  # the trace goes on for so long, until the chambers are empty
+RUN_MARGIN_S = 60.0  # for start, arming, venting and closing of the runtime, beyond its ticks
+SETTLE_S = 1.5  # the traces continue for so long after the runtime, until the chambers are empty
 
 
 @click.command("modsoft-hil", context_settings={"show_default": True})
@@ -32,18 +32,18 @@ AFTER_S = 1.5  # the trace goes on for so long, until the chambers are empty
     "--report",
     required=True,
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder to write, new or empty; one that holds a report already is refused.",
+    help="Folder to write: new or empty; a folder with a report is refused.",
 )
 @click.option(
     "--board",
     default="auto",
     type=click.Choice(["auto", "simavr", "native"]),
     help="simavr: the compiled firmware on an emulated ATmega2560. native: its logic compiled for this "
-    "machine. auto: simavr where it can be had.",
+    "machine. auto: simavr where it is installed.",
 )
 @click.option("--steps", type=click.IntRange(1), help="Run only so many control steps.  [default: the whole task]")
 def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps: int | None) -> int:
-    """Run a controller in real time on hardware that is not there, and judge the run.
+    """Run a controller in real time on emulated hardware and check the run against its criteria.
 
     \b
     Example:
@@ -51,20 +51,20 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
 
     \b
     Exit code:
-      0    every acceptance holds
-      1    one does not
-      3    not judged: the host was too slow, or the run shorter than 100 control steps
+      0    passed: every criterion is met
+      1    failed: one is not met
+      3    inconclusive: the host was too slow, or the run shorter than 100 control steps
     Others are those of modsoft-runtime (64 robot file, 65 model, 69 something is missing, ...).
 
     The folder gets report.md, report.json, angles.png, run.jsonl (the runtime's log), board.jsonl (timer registers of
-    the emulated board) and plant.jsonl (the simulated robot). Nothing else should keep the processor busy meanwhile.
-    A run that is interrupted leaves its traces there and no report; the next one into the folder replaces them.
+    the emulated board) and plant.jsonl (the simulated robot). Run nothing else on the machine meanwhile. An
+    interrupted run leaves its traces there and no report; the next run into this folder replaces them.
     """
     _check_system()
     from tqdm import tqdm
 
     from modsoft.hil import (
-        criteria,  # after --help: their libraries take a second
+        criteria,  # imported here: --help must not wait for their libraries
         record,
         report_folder,
     )
@@ -76,9 +76,9 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     report_folder.check(report)
     robot = load_robot(robot_file)
     desired = load_task(task, robot)
-    Model.load(model).check(robot)  # the runtime does it too; here it saves the start of the rig
-    asked = desired[:steps]
-    count = len(asked)
+    Model.load(model).check(robot)  # the runtime does it too; here it fails before the rig starts
+    desired = desired[:steps]
+    count = len(desired)
     build(choose(board))
 
     options = [] if steps is None else ["--steps", str(steps)]
@@ -88,12 +88,12 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
             with rig:
                 rig.run(model, task, *options)
                 with tqdm(total=count, unit=" ticks", desc="run", disable=not sys.stderr.isatty()) as bar:
-                    rig.wait(count * robot.loop.period_s + RUN_SLACK_S, lambda ticks: bar.update(ticks - bar.n))
-                rig.settle(AFTER_S)
+                    rig.wait(count * robot.loop.period_s + RUN_MARGIN_S, lambda ticks: bar.update(ticks - bar.n))
+                rig.settle(SETTLE_S)
         finally:
-            ran = _move_log(rig, report)
-    found = record.read(report, report if ran else None, robot, task, asked, rig.runtime.returncode)
-    verdict = criteria.judge(found)
+            has_log = _move_log(rig, report)
+    run = record.read(report, report if has_log else None, robot, task, desired, rig.runtime.returncode)
+    assessment = criteria.assess(run)
     about = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": f"modsoft-hil --robot {Path(robot_file).name} --model {model.name} --task {Path(task).name} "
@@ -105,29 +105,29 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
         "robot": f"{robot.name}, {robot.modules} modules, {robot.loop.hz:g} Hz",
         "task": f"{task}, {count} control steps",
     }
-    if trouble := reports.write(found, verdict, about, report):
-        click.echo(f"modsoft-hil: {trouble}", err=True)
-    for line in [*verdict.criteria, *verdict.host_load_checks]:
-        click.echo(f"{'ok' if line.ok else 'NO':>4}  {line.name}: {line.found} ({line.limit})")
-    if found.runtime_exit:
-        click.echo(f"modsoft-runtime said: {found.runtime_said or 'nothing'}")
-    click.echo(f"{verdict}\n{report / 'report.md'}")
-    # a run that never began is judged by what the runtime said, not by the figures it could not have
-    return found.runtime_exit if found.runtime_exit and not len(found.tick) else verdict.exit_code
+    if no_picture := reports.write(run, assessment, about, report):
+        click.echo(f"modsoft-hil: {no_picture}", err=True)
+    for line in [*assessment.criteria, *assessment.host_load_checks]:
+        click.echo(f"{'ok' if line.met else 'NO':>4}  {line.name}: {line.measured} ({line.limit})")
+    if run.runtime_exit:
+        click.echo(f"last line of modsoft-runtime: {run.runtime_said or 'none'}")
+    click.echo(f"{assessment}\n{report / 'report.md'}")
+    # a run without a tick has no figures: its exit code is the runtime's
+    return run.runtime_exit if run.runtime_exit and not len(run.tick) else assessment.exit_code
 
 
 def _check_system() -> None:
-    """The emulated board and the fake tracker are serial ports on pseudo-terminals; the board is built with Linux's
-    headers."""
+    """`DeviceAbsent` on other systems than Linux: the serial ports are pseudo-terminals, and the board is built with
+    Linux's headers."""
     if not sys.platform.startswith("linux") or not all(map(system_module, ("fcntl", "pty", "tty"))):
         raise DeviceAbsent(
-            "the rig needs Linux (pseudo-terminals, simavr); run it there, or in WSL or a virtual machine. "
-            "modsoft-runtime --dry-run works here"
+            "the rig needs Linux (pseudo-terminals, simavr); use Linux, WSL or a virtual machine, "
+            "or modsoft-runtime --dry-run on this system"
         )
 
 
 def _move_log(rig: Rig, report: Path) -> bool:
-    """Moves the runtime's log beside the other traces and deletes its folder; returns whether there was a log."""
+    """Moves the runtime's log beside the other traces and deletes its folder; returns whether a log existed."""
     from modsoft.hil.report_folder import RUN_FILES
 
     run = rig.run_folder()

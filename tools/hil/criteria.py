@@ -1,8 +1,7 @@
-"""The verdict on a run of the rig: one line for each acceptance, from the run log, the timer registers and the plant.
+"""The criteria that a run of the rig has to meet, from the run log, the timer registers and the simulated robot.
 
-The sources are independent of each other: what the runtime says it did (`run.jsonl`), what the emulated board's timer
-registers held (`board.jsonl`), and where the simulated robot really was (`plant.jsonl`). Nothing here reads a clock
-or a file; `modsoft.hil.record` does.
+The three sources are independent: the runtime's log (`run.jsonl`), the emulated board's timer registers (`board.jsonl`)
+and the state of the simulated robot (`plant.jsonl`). Nothing here reads a clock or a file; `modsoft.hil.record` does.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import angle_between_deg, bending_error_deg
 from modsoft.runtime.statistics import spread
 
-# ---- What a run has to show -------------------------------------------------------------------------------------
+# ---- Limits ----------------------------------------------------------------------------------------------------
 
-FEWEST_TICKS = 100  # below it a 99th percentile says nothing
+MIN_TICKS = 100  # fewer give no 99th percentile
 MISSED_TICKS = 0
 HELD_TICKS = 0
 LATENESS_P99_MS = 20.0
 VALVE_COUNTS = 1.0  # of the timer: a set-point is rounded to counts once
 DROPPED_BYTES = 0
 CHAMBERS_AT_END_BAR = 0.02
-DESIRED_OFF = 1e-9  # of a component: the log rounds to nine digits
-MEASURED_OFF_DEG = 1.0  # the tracker rounds, and its frame is up to 40 ms old while the robot moves
+DESIRED_ERROR = 1e-9  # of a component: the log rounds to nine digits
+MEASUREMENT_ERROR_DEG = 1.0  # the tracker rounds, and its frame is up to 40 ms old while the robot moves
 # Mean tracking error of each module, degrees, by task and number of modules: about twice what four minutes of training
 # on three modules were measured to reach: down 0.05 1.03 1.88 and 0.95 1.81, edge 0.10 0.58 3.11 and 0.74 2.51.
 TRACKING_DEG: dict[tuple[str, int], list[float]] = {
@@ -44,47 +43,47 @@ TRACKING_DEG: dict[tuple[str, int], list[float]] = {
     ("down", 2): [2.0, 3.5],
     ("edge", 2): [1.5, 5.0],
 }
-# Limits of the host-load checks: beyond these the timing says more about the host than about the software. A stall
-# of the board lengthens the acknowledgements that are judged and spares its own time-outs: one heartbeat of it (100 ms;
-# the shortest time-out is 300 ms) hides nothing. The plant catches up; a quarter of a control period is still in time.
+# Limits of the host-load checks. Beyond them the timing depends on the host more than on the software. A stall of the
+# board lengthens the measured acknowledgements and delays its own time-outs: a stall of one heartbeat (100 ms; the
+# shortest time-out is 300 ms) hides no fault. The simulated robot catches up; a quarter of a control period is in time.
 BOARD_LATE_MS = 100.0
 BOARD_SLIPPED_PERCENT = 0.5  # of the run, in stalls
 PLANT_LATE_MS = 100.0
 
 
 class Criterion(NamedTuple):
-    """One line of the verdict. `timing` lines are void on a host that did not keep up."""
+    """One criterion with its measured value. `timing` criteria are void on a host that did not keep up."""
 
     name: str
-    found: str
+    measured: str
     limit: str
-    ok: bool
+    met: bool
     timing: bool = False
 
 
-class Verdict(NamedTuple):
-    """`word`: passed, failed, or not judged; `reason` says why where it is not passed."""
+class Assessment(NamedTuple):
+    """outcome: passed, failed, or inconclusive; reason: empty where the run passed."""
 
-    word: str
+    outcome: str
     reason: str
     criteria: list[Criterion]
     host_load_checks: list[Criterion]
 
     @property
     def exit_code(self) -> int:
-        return {"passed": 0, "failed": 1, "not judged": 3}[self.word]
+        return {"passed": 0, "failed": 1, "inconclusive": 3}[self.outcome]
 
     def __str__(self) -> str:
-        return f"{self.word}: {self.reason}" if self.reason else self.word
+        return f"{self.outcome}: {self.reason}" if self.reason else self.outcome
 
 
 # ---- Figures ------------------------------------------------------------------------------------------------------
 
 
 def p99(values: Array) -> float:
-    """The measured value that 99 percent do not exceed. NaN of nothing."""
-    found = spread(list(values))
-    return found["p99"] if found else math.nan
+    """The measured value that 99 percent do not exceed; NaN for no values."""
+    figures = spread(list(values))
+    return figures["p99"] if figures else math.nan
 
 
 def tracking_error_deg(record: Record) -> Array:
@@ -92,50 +91,51 @@ def tracking_error_deg(record: Record) -> Array:
     return bending_error_deg(record.configuration, record.desired)
 
 
-def desired_off(record: Record) -> float:
-    """Largest difference of a component of the logged desired configurations from the task's own, by tick."""
+def desired_error(record: Record) -> float:
+    """Largest difference of a component of the logged desired configurations from those of the task."""
     if np.any(record.tick >= record.steps):
         return math.inf
-    return _worst(np.abs(record.desired - record.asked[record.tick]))
+    return _largest(np.abs(record.desired - record.asked[record.tick]))
 
 
-def measured_off_deg(record: Record) -> Array:
-    """Angle (K, N) between the configuration that the runtime used and the plant's own when that frame came in."""
-    plant, when = record.plant_configuration, record.plant_mono_ns
-    at = np.clip(np.searchsorted(when, record.frame_mono_ns), 1, len(when) - 1)
-    share = (record.frame_mono_ns - when[at - 1]) / (when[at] - when[at - 1])
-    share = np.clip(share, 0.0, 1.0)[:, None, None]
-    return angle_between_deg(record.configuration, (1 - share) * plant[at - 1] + share * plant[at])
+def measurement_error_deg(record: Record) -> Array:
+    """Angle (K, N) between the configuration that the runtime used and the simulated robot's at that frame's time."""
+    plant, times_ns = record.plant_configuration, record.plant_mono_ns
+    after = np.clip(np.searchsorted(times_ns, record.frame_mono_ns), 1, len(times_ns) - 1)
+    weight = (record.frame_mono_ns - times_ns[after - 1]) / (times_ns[after] - times_ns[after - 1])
+    weight = np.clip(weight, 0.0, 1.0)[:, None, None]
+    return angle_between_deg(record.configuration, (1 - weight) * plant[after - 1] + weight * plant[after])
 
 
-# ---- Verdict ------------------------------------------------------------------------------------------------------
+def _largest(values: Array) -> float:
+    return float(np.nanmax(values)) if np.isfinite(values).any() else math.nan
 
 
-def at_most(name: str, found: float, limit: float, unit: str = "", timing: bool = False) -> Criterion:
-    """A line that holds when found <= limit; NaN never holds."""
-    words = f"at most {limit:g}{unit}" if limit else "0"
-    return Criterion(name, f"{found:.3g}{unit}", words, bool(found <= limit), timing)
+# ---- Criteria -----------------------------------------------------------------------------------------------------
+
+
+def at_most(name: str, value: float, limit: float, unit: str = "", timing: bool = False) -> Criterion:
+    """Met when value <= limit; never met by NaN."""
+    limit_text = f"at most {limit:g}{unit}" if limit else "0"
+    return Criterion(name, f"{value:.3g}{unit}", limit_text, bool(value <= limit), timing)
 
 
 def criteria(record: Record) -> list[Criterion]:
-    """Every acceptance of the run, timing ones marked."""
-    count = len(record.tick)
-    late_ms = p99(record.lateness_ms)
-    unacknowledged = int(np.isnan(record.acknowledged_ms).sum())
-    acknowledged = record.acknowledged_ms[~np.isnan(record.acknowledged_ms)]
-    differences = valve_difference(record)
-    highest = float(np.max(record.outputs.duty, initial=0.0)) * record.outputs.counts
-    allowed = round(record.robot.valve.p_max_bar * full_counts_per_bar(record), 2) if record.robot.valve else 0.0
-    running = [event for event in record.board_events if count and event["mono_ns"] >= record.mono_ns[0]]
-    watchdogs = sum(event["event"] == "watchdog" for event in record.board_events)
-    faulty = [f"0x{value:04x}" for value in np.unique(record.faults[record.faults != 0])]
-    not_running = [state for state in record.state if state != "RUNNING"]
-    lines = [
+    """Every criterion of the run."""
+    return [*loop_criteria(record), *valve_criteria(record), *board_criteria(record), *robot_criteria(record)]
+
+
+def loop_criteria(record: Record) -> list[Criterion]:
+    """The control loop, from the run log."""
+    count, late_ms = len(record.tick), p99(record.lateness_ms)
+    missing = np.isnan(record.acknowledged_ms)
+    acknowledged_ms = p99(record.acknowledged_ms[~missing])
+    return [
         Criterion("exit code of modsoft-runtime", str(record.runtime_exit), "0", record.runtime_exit == 0),
         Criterion("ticks", str(count), str(record.steps), count == record.steps),
-        at_most("desired configurations off the task's own", desired_off(record), DESIRED_OFF),
+        at_most("desired configurations: difference from the task's", desired_error(record), DESIRED_ERROR),
         at_most("missed ticks", record.missed, MISSED_TICKS, timing=True),
-        at_most("ticks held for want of a good tracker frame", record.held, HELD_TICKS, timing=True),
+        at_most("held ticks: no valid tracker frame", record.held, HELD_TICKS, timing=True),
         Criterion(
             "lateness of a tick, 99th percentile",
             f"{late_ms:.2f} ms",
@@ -143,77 +143,96 @@ def criteria(record: Record) -> list[Criterion]:
             late_ms < LATENESS_P99_MS,
             True,
         ),
-        at_most("set-points never acknowledged", unacknowledged, 0, timing=True),
+        at_most("set-points without acknowledgement", int(missing.sum()), 0, timing=True),
         at_most(
-            "set-point to acknowledgement, 99th percentile", p99(acknowledged), ACKNOWLEDGED_P99_MS, " ms", timing=True
+            "set-point to acknowledgement, 99th percentile", acknowledged_ms, ACKNOWLEDGED_P99_MS, " ms", timing=True
         ),
+    ]
+
+
+def valve_criteria(record: Record) -> list[Criterion]:
+    """The valve outputs, from the timer registers, against the logged set-points."""
+    differences = valve_difference(record)
+    highest = float(np.max(record.outputs.duty, initial=0.0)) * record.outputs.counts
+    allowed = round(record.robot.valve.p_max_bar * full_counts_per_bar(record), 2) if record.robot.valve else 0.0
+    vented_ms = record.outputs.vented_after_ms(record.end_us)
+    return [
         at_most(
-            "valve outputs off the log, worst of every tick and channel", _worst(differences), VALVE_COUNTS, " counts"
-        ),
-        at_most(
-            "valve outputs outside old and new set-point, worst of all times and channels",
-            _worst(valve_excursion(record)),
+            "valve outputs: largest difference from the settled set-point",
+            _largest(differences),
             VALVE_COUNTS,
             " counts",
         ),
-        at_most("largest valve output ever", highest, allowed + VALVE_COUNTS, " counts"),
+        at_most(
+            "valve outputs: largest distance outside old and new set-point",
+            _largest(valve_excursion(record)),
+            VALVE_COUNTS,
+            " counts",
+        ),
+        at_most("largest valve output", highest, allowed + VALVE_COUNTS, " counts"),
         at_most("largest duty before the first set-point", largest_duty_before(record), 0.0),
         at_most("ticks without time for the valves to settle", int(np.isnan(differences).sum()), 0),
-        Criterion("faults of the board", ", ".join(faulty) or "none", "none", not faulty),
-        at_most("ticks that the board did not follow", len(not_running), 0),
-        at_most("resets in the run", sum(event["event"] == "reset" for event in running), 0),
+        Criterion("vented, as reported by the board", _yes(record.said_vented), "yes", record.said_vented),
+        at_most("all valve outputs at 0, after the vent began", vented_ms, vent_limit_ms(record), " ms"),
+    ]
+
+
+def board_criteria(record: Record) -> list[Criterion]:
+    """Faults, resets and losses of the board."""
+    count = len(record.tick)
+    in_run = [event for event in record.board_events if count and event["mono_ns"] >= record.mono_ns[0]]
+    watchdogs = sum(event["event"] == "watchdog" for event in record.board_events)
+    faults = [f"0x{value:04x}" for value in np.unique(record.faults[record.faults != 0])]
+    not_running = [state for state in record.state if state != "RUNNING"]
+    return [
+        Criterion("faults of the board", ", ".join(faults) or "none", "none", not faults),
+        at_most("ticks with the board not RUNNING", len(not_running), 0),
+        at_most("resets in the run", sum(event["event"] == "reset" for event in in_run), 0),
         at_most("watchdog resets", watchdogs, 0),
         at_most("bytes dropped by the board's receiver", record.board_dropped_bytes, DROPPED_BYTES),
-        Criterion("the board's word that it vented", "yes" if record.said_vented else "no", "yes", record.said_vented),
-        at_most(
-            "valve outputs at 0 permanently, after the vent began",
-            record.outputs.vented_after_ms(record.end_us),
-            vent_limit_ms(record),
-            " ms",
-        ),
-        at_most(
-            "highest chamber pressure at the end",
-            float(np.max(record.plant_bar[-1])) if len(record.plant_bar) else math.nan,
-            CHAMBERS_AT_END_BAR,
-            " bar",
-        ),
     ]
-    if count and len(record.plant_mono_ns) > 1:
-        off = measured_off_deg(record)
-        lines.append(at_most("configuration used, off the plant's own", _worst(off), MEASURED_OFF_DEG, "°"))
-        mean = np.nanmean(tracking_error_deg(record), axis=0)
-        for module, limit in enumerate(TRACKING_DEG.get((record.task, record.robot.modules), [])):
-            name = f"tracking error of module {module + 1}, mean"
-            lines.append(at_most(name, float(mean[module]), limit, "°", timing=True))
-    else:
-        lines.append(Criterion("configuration used, off the plant's own", "no ticks", "some", False))
+
+
+def robot_criteria(record: Record) -> list[Criterion]:
+    """The simulated robot: pressures at the end, measured configurations, tracking errors of the shipped tasks."""
+    pressure_bar = float(np.max(record.plant_bar[-1])) if len(record.plant_bar) else math.nan
+    lines = [at_most("highest chamber pressure at the end", pressure_bar, CHAMBERS_AT_END_BAR, " bar")]
+    name = "measured configuration: angle to the simulated robot's"
+    if not len(record.tick) or len(record.plant_mono_ns) < 2:
+        return [*lines, Criterion(name, "no ticks", f"at most {MEASUREMENT_ERROR_DEG:g}°", False)]
+    lines.append(at_most(name, _largest(measurement_error_deg(record)), MEASUREMENT_ERROR_DEG, "°"))
+    mean_deg = np.nanmean(tracking_error_deg(record), axis=0)
+    for module, limit in enumerate(TRACKING_DEG.get((record.task, record.robot.modules), [])):
+        name = f"tracking error of module {module + 1}, mean"
+        lines.append(at_most(name, float(mean_deg[module]), limit, "°", timing=True))
     return lines
 
 
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"
+
+
 def host_load_checks(record: Record) -> list[Criterion]:
-    """Whether the board and the plant were real time."""
+    """Whether the board and the simulated robot ran in real time."""
     plant_ms = float(np.max(record.plant_late_ms)) if len(record.plant_late_ms) else math.nan
     return [
-        at_most("emulated board behind real time, at most", record.board_late_ms, BOARD_LATE_MS, " ms"),
-        at_most("run lost to stalls of the board", record.board_slipped_percent, BOARD_SLIPPED_PERCENT, " %"),
-        at_most("simulated robot behind real time, at most", plant_ms, PLANT_LATE_MS, " ms"),
+        at_most("emulated board behind real time", record.board_late_ms, BOARD_LATE_MS, " ms"),
+        at_most("time lost to stalls of the board", record.board_slipped_percent, BOARD_SLIPPED_PERCENT, " %"),
+        at_most("simulated robot behind real time", plant_ms, PLANT_LATE_MS, " ms"),
     ]
 
 
-def judge(record: Record) -> Verdict:
-    """Passed only when every acceptance holds on a host that kept up, in a run long enough to say so."""
-    lines, seen = criteria(record), host_load_checks(record)
-    slow = [line for line in seen if not line.ok]
-    broken = [line for line in lines if not line.ok and not (line.timing and slow)]
-    if broken:
-        return Verdict("failed", "; ".join(f"{line.name} {line.found}" for line in broken), lines, seen)
+def assess(record: Record) -> Assessment:
+    """Passed when every criterion is met, on a host that kept up, in a run of at least `MIN_TICKS`."""
+    lines, host_load = criteria(record), host_load_checks(record)
+    slow = [line for line in host_load if not line.met]
+    unmet = [line for line in lines if not line.met and not (line.timing and slow)]
+    if unmet:
+        return Assessment("failed", "; ".join(f"{line.name} {line.measured}" for line in unmet), lines, host_load)
     if slow:
-        why = "; ".join(f"{line.name} {line.found} ({line.limit})" for line in slow)
-        return Verdict("not judged", f"the host was too slow: {why}", lines, seen)
-    if record.steps < FEWEST_TICKS:
-        return Verdict("not judged", f"{record.steps} ticks, at least {FEWEST_TICKS} are needed", lines, seen)
-    return Verdict("passed", "", lines, seen)
-
-
-def _worst(values: Array) -> float:
-    return float(np.nanmax(values)) if np.isfinite(values).any() else math.nan
+        reason = "; ".join(f"{line.name} {line.measured} ({line.limit})" for line in slow)
+        return Assessment("inconclusive", f"the host was too slow: {reason}", lines, host_load)
+    if record.steps < MIN_TICKS:
+        reason = f"{record.steps} ticks, at least {MIN_TICKS} are needed"
+        return Assessment("inconclusive", reason, lines, host_load)
+    return Assessment("passed", "", lines, host_load)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from modsoft.hil import outputs, record, valves
-from modsoft.hil.criteria import DESIRED_OFF, VALVE_COUNTS, desired_off
+from modsoft.hil.criteria import DESIRED_ERROR, VALVE_COUNTS, desired_error
 from modsoft.hil.faults import ON_ITS_OWN_MS, Fault
 from modsoft.runtime import log as logs
 from modsoft.runtime.errors import LostInRun
@@ -123,7 +123,7 @@ def judge_valves(ran: Ran, found: record.Record, stopped_ns: int | None) -> None
             ran.wrong.append(f"a valve {counts:.0f} counts {word} what was commanded")
     if valves.largest_duty_before(found) > 0:
         ran.wrong.append("a valve was open before the first set-point")
-    if not desired_off(found) <= DESIRED_OFF:
+    if not desired_error(found) <= DESIRED_ERROR:
         ran.wrong.append("the log's desired configurations are not the task's")
     if found.outputs.duty[-1:].any():
         ran.wrong.append("a valve was left open")

@@ -1,4 +1,4 @@
-"""The report of a run: report.md to read, report.json with every figure, angles.png to look at."""
+"""The report of a run: report.md (text), report.json (every figure) and angles.png (plot)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from modsoft.hil.criteria import Criterion, Verdict, measured_off_deg, tracking_error_deg
+from modsoft.hil.criteria import Assessment, Criterion, measurement_error_deg, tracking_error_deg
 from modsoft.hil.record import Record
 from modsoft.hil.report_folder import FINISHED
 from modsoft.hil.valves import valve_difference
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CLOCKS = (
-    "Tick lateness and acknowledgement times: the host's CLOCK_MONOTONIC, taken by modsoft-runtime. Valve outputs: the "
-    "emulated board's timer registers (native board: what its logic asks for), stamped with its cycle counter and, for "
-    "the comparison with the log, with CLOCK_MONOTONIC at the moment of emulation. Simulated robot: the same clock, at "
-    "absolute deadlines. Tracking errors: from what the runtime measured, which is itself held against the simulated "
-    "robot's true state."
+    "Tick lateness and acknowledgement times: the host's CLOCK_MONOTONIC, measured by modsoft-runtime. Valve outputs: "
+    "the emulated board's timer registers (native board: the outputs of its logic), stamped with its cycle counter "
+    "and, for the comparison with the log, with CLOCK_MONOTONIC at the time of emulation. Simulated robot: "
+    "CLOCK_MONOTONIC, at absolute deadlines. Tracking errors: from the configurations that the runtime measured, which "
+    "are compared with the state of the simulated robot."
 )
 NOT_SHOWN = (
-    "What this rig cannot show: electromagnetic noise, real USB latency, brown-out, the dynamics of air, "
-    "what a valve does without power."
+    "Not covered by this rig: electromagnetic noise, real USB latency, brown-out, the dynamics of air, the state of a "
+    "valve without power."
 )
 
 
@@ -49,98 +49,103 @@ def figures(record: Record) -> dict[str, Any]:
         "plant_late_ms": spread(list(record.plant_late_ms)),
     }
     if len(record.tick) and len(record.plant_mono_ns) > 1:
-        error, off = tracking_error_deg(record), measured_off_deg(record)
-        apart = 100.0 * np.linalg.norm(record.configuration - record.desired, axis=-1)
+        error_deg, measurement_deg = tracking_error_deg(record), measurement_error_deg(record)
+        distance = 100.0 * np.linalg.norm(record.configuration - record.desired, axis=-1)
         figure |= {
-            "tracking_error_deg": _by_module(error),
-            "tracking_error_percent": _by_module(apart),
+            "tracking_error_deg": _by_module(error_deg),
+            "tracking_error_percent": _by_module(distance),
             "out_of_plane_deg": _by_module(_out_of_plane_deg(record)),
-            "measured_off_plant_deg": spread(list(off[np.isfinite(off)])),
+            "measurement_error_deg": spread(list(measurement_deg[np.isfinite(measurement_deg)])),
         }
     return figure
 
 
-def write(record: Record, verdict: Verdict, about: dict[str, str], folder: Path) -> str:
-    """Writes the three files into `folder`, report.json last: where it is, the others are. `about` says what ran, in
-    the order it is shown. Returns why there is no picture of the run, if there is none: the text is written anyway."""
-    found = figures(record)
-    table = [line._asdict() for line in [*verdict.criteria, *verdict.host_load_checks]]
+def write(record: Record, assessment: Assessment, about: dict[str, str], folder: Path) -> str:
+    """Writes the three files into `folder`, report.json last, so that a report with it is complete.
+
+    about: what ran, in the order shown. Returns why angles.png is missing, empty where it is not; the text is written
+    in either case.
+    """
+    values = figures(record)
+    table = [line._asdict() for line in [*assessment.criteria, *assessment.host_load_checks]]
     document = {
-        "verdict": verdict.word,
-        "reason": verdict.reason,
+        "outcome": assessment.outcome,
+        "reason": assessment.reason,
         "about": about,
         "criteria": table,
-        "figures": found,
+        "figures": values,
     }
-    trouble = ""
+    no_picture = ""
     if len(record.tick):
         try:
             plotting.save(lambda: picture(record), folder / "angles.png", dpi=110)
-        except Exception as error:  # noqa: BLE001 - no failure of a picture is worth the report of a whole run
-            trouble = f"angles.png is missing: {' '.join(str(error).split())}"
+        except Exception as error:  # noqa: BLE001 - whatever fails in the plot, the report is kept
+            no_picture = f"angles.png is missing: {' '.join(str(error).split())}"
     with written(folder / "report.md") as temporary:
-        temporary.write_text(text(record, verdict, about, found, trouble), encoding="utf-8")
+        temporary.write_text(text(record, assessment, about, values, no_picture), encoding="utf-8")
     with written(folder / FINISHED) as temporary:
         temporary.write_text(json.dumps(_plain(document), indent=1) + "\n", encoding="utf-8")
-    return trouble
+    return no_picture
 
 
-def text(record: Record, verdict: Verdict, about: dict[str, str], found: dict[str, Any], trouble: str = "") -> str:
-    """report.md; `trouble`: why it has no picture."""
-    lines = [f"# {record.robot.name}, task {record.task}: {verdict}", ""]
+def text(
+    record: Record, assessment: Assessment, about: dict[str, str], values: dict[str, Any], no_picture: str = ""
+) -> str:
+    """report.md; `no_picture`: why angles.png is missing."""
+    lines = [f"# {record.robot.name}, task {record.task}: {assessment}", ""]
     lines += [f"- {name}: {value}" for name, value in about.items()]
     if record.runtime_exit:
-        lines += [f"- modsoft-runtime said: {record.runtime_said or 'nothing'}"]
-    lines += ["", "| acceptance | found | limit | |", "| --- | --- | --- | --- |"]
-    void = any(not check.ok for check in verdict.host_load_checks)
-    lines += [_row(line, void) for line in verdict.criteria]
-    lines += ["", "| did the host keep up? | found | limit | |", "| --- | --- | --- | --- |"]
-    lines += [_row(line, False) for line in verdict.host_load_checks]
-    if "tracking_error_deg" in found:
-        lines += ["", trouble or "![desired and reached angles](angles.png)", "", *_tracking_table(found)]
+        lines += [f"- last line of modsoft-runtime: {record.runtime_said or 'none'}"]
+    lines += ["", "| criterion | measured | limit | met |", "| --- | --- | --- | --- |"]
+    void = any(not check.met for check in assessment.host_load_checks)
+    lines += [_row(line, void) for line in assessment.criteria]
+    lines += ["", "| host load | measured | limit | met |", "| --- | --- | --- | --- |"]
+    lines += [_row(line, False) for line in assessment.host_load_checks]
+    if "tracking_error_deg" in values:
+        lines += ["", no_picture or "![desired and reached angles](angles.png)", "", *_tracking_table(values)]
     lines += ["", "| | median | 99th percentile | largest |", "| --- | --- | --- | --- |"]
     for name, key in TIMES.items():
-        if told := found[key]:
-            lines.append(f"| {name} | {told['p50']:.2f} | {told['p99']:.2f} | {told['max']:.2f} |")
+        if figure := values[key]:
+            lines.append(f"| {name} | {figure['p50']:.2f} | {figure['p99']:.2f} | {figure['max']:.2f} |")
     return "\n".join([*lines, "", f"Clocks. {CLOCKS}", "", NOT_SHOWN, ""])
 
 
 TIMES = {
     "lateness of a tick, ms": "lateness_ms",
     "set-point to acknowledgement, ms": "acknowledged_ms",
-    "valve outputs off the log, counts": "valve_difference_counts",
+    "valve outputs: difference from the set-point, counts": "valve_difference_counts",
     "simulated robot behind real time, ms": "plant_late_ms",
 }
 
 
 def _row(line: Criterion, void: bool) -> str:
-    word = "void" if line.timing and void else "ok" if line.ok else "**no**"
-    return f"| {line.name} | {line.found} | {line.limit} | {word} |"
+    met = "void" if line.timing and void else "yes" if line.met else "**no**"
+    return f"| {line.name} | {line.measured} | {line.limit} | {met} |"
 
 
-def _tracking_table(found: dict[str, Any]) -> list[str]:
+def _tracking_table(values: dict[str, Any]) -> list[str]:
     """Tracking errors by module, mean ± standard deviation, and the largest."""
     rows = {
         "bending angle, °": "tracking_error_deg",
         "distance of the unit vectors, %": "tracking_error_percent",
     }
-    modules = range(1, len(found["tracking_error_deg"]["mean"]) + 1)
+    modules = range(1, len(values["tracking_error_deg"]["mean"]) + 1)
     lines = [
         "| tracking error | " + " | ".join(f"module {module}" for module in modules) + " |",
         "| --- |" + " --- |" * len(modules),
     ]
     for name, key in rows.items():
-        by = found[key]
+        by = values[key]
         cells = [f"{m:.2f} ± {s:.2f} (≤ {w:.2f})" for m, s, w in zip(by["mean"], by["std"], by["max"], strict=True)]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return lines
 
 
-# ---- Picture ------------------------------------------------------------------------------------------------------
+# ---- Plot ---------------------------------------------------------------------------------------------------------
 
 
 def picture(record: Record) -> Figure:
-    """Angles above, pressures below, one column a module."""
+    """Angles above, pressures below, one column for each module."""
     modules, start = record.robot.modules, record.mono_ns[0]
     at_tick, at_slice = (record.mono_ns - start) * 1e-9, (record.plant_mono_ns - start) * 1e-9
     figure = plotting.figure(5.2 * modules, 7.0)
@@ -160,8 +165,8 @@ def picture(record: Record) -> Figure:
         for side, colour in (("+", "#2ca02c"), ("-", "#9467bd")):
             commanded = record.commanded_bar[:, channels[f"{module + 1}{side}"]]
             inside = record.plant_bar[:, module, "+-".index(side)]
-            # Inside and commanded differ little: a broad light band, and the thin line on it.
-            below.plot(at_slice, inside, color=colour, lw=5.0, alpha=0.3, label=f"chamber {side}, inside")
+            # Measured and commanded pressures differ little: a broad light line below a thin one.
+            below.plot(at_slice, inside, color=colour, lw=5.0, alpha=0.3, label=f"chamber {side}, measured")
             below.step(at_tick, commanded, where="post", color=colour, lw=1.1, label=f"chamber {side}, commanded")
         below.set_xlabel("time, s")
         below.grid(alpha=0.3)
@@ -194,7 +199,7 @@ def _out_of_plane_deg(record: Record) -> np.ndarray:
 
 
 def _plain(value: Any) -> Any:
-    """JSON has no NaN."""
+    """Plain values for JSON: None for what is not finite."""
     if isinstance(value, dict):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""A made-up flawless run of the rig, in which tests plant flaws."""
+"""A synthetic reference run of the rig that meets every criterion; tests change single values of it."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ ROBOT = robots.load("pneumatic-3")
 
 
 def slewed(start, commanded):
-    """Timer registers of a board that follows: 5 ms after the tick, one change every 10 ms at the slew limit."""
+    """Outputs of a board that follows the set-points: 5 ms after the tick, then a step every 10 ms at the slew."""
     times, rows = [], []
     applied = np.zeros(commanded.shape[1])
     end = START_NS + len(commanded) * PERIOD_NS
@@ -36,7 +36,7 @@ def outputs_at(mono_ns, duty):
     return ValveOutputs(mono_ns, mono_ns * 1e-3, duty, COUNTS)
 
 
-def flawless_run():
+def reference_run():
     k = np.arange(TICKS)
     actuation = np.sin(k / 9.0)[:, None, None] * np.array([[0.2], [0.6], [-1.0]])
     commanded = np.array([channel_pressures_bar(ROBOT, a) for a in actuation])
@@ -84,8 +84,8 @@ def flawless_run():
     )
 
 
-def told(record, from_ns, until_ns, counts, channel=0):
-    """One channel at `counts` from an instant to another, whatever else the registers say meanwhile."""
+def with_output(record, from_ns, until_ns, counts, channel=0):
+    """The outputs of a run with one channel at `counts` from one instant to another."""
     valves = record.outputs
     edges = [valves.between(at, at)[-1] for at in (from_ns, until_ns)]
     mono_ns = np.concatenate([valves.mono_ns, [from_ns, until_ns]])
