@@ -55,7 +55,7 @@ def test_sources_compile_without_a_warning(board_name: emulator.BoardName, tmp_p
 def test_firmware_that_cannot_be_read_ends_in_one_line(tmp_path: Path) -> None:
     broken = tmp_path / "broken.hex"
     broken.write_text("no hex\n")
-    with pytest.raises(DeviceAbsent, match=r"did not start: board: .*broken\.hex is not an Intel hex file"):
+    with pytest.raises(DeviceAbsent, match=r"did not start: board: .*broken\.hex is not a readable Intel hex file"):
         EmulatedBoard("simavr", firmware=broken).start()
 
 
