@@ -1,5 +1,5 @@
-"""The control step, once: from the measured configurations to an actuation within every limit. The loop on the robot
-and every simulated rollout run this code."""
+"""The control step: from measured configurations to an actuation within all limits. The control loop of the robot and
+the simulated rollouts share it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from modsoft.runtime.safety import check_actuation
 
 
 class Policy(Protocol):
-    """Features (N, F) of a control step to actuation (N, A), not limited; `history`: time steps T in the features."""
+    """`actuate`: features (N, F) of a control step to actuation (N, A), not limited. `history`: time steps T of the
+    features."""
 
     @property
     def history(self) -> int: ...
@@ -26,25 +27,25 @@ class Policy(Protocol):
 
 
 class Controller:
-    """One object a run. It holds the feature window, the last measured state and the actuation in force; in each
-    control step `compute` is called once, then `record`."""
+    """The controller of one run: feature window, last measured state, applied actuation. In each control step call
+    `compute`, then `record`."""
 
     def __init__(self, robot: Robot, policy: Policy, rest: Array, correction: Correction | None = None):
-        """rest: configuration (N, 3) at the start, with actuation 0 in force. correction: a new one, or none."""
+        """rest: configuration (N, 3) at the start, where the actuation is 0. correction: a new object, or None."""
         self._robot, self._policy = robot, policy
         self._correction = NoCorrection() if correction is None else correction
         self._state = state_of(rest, robot.kind)
         self.window = Window(policy.history, self._state, robot.action_size)
-        self.applied = np.zeros((robot.modules, robot.action_size))  # in force
-        self.target: Array | None = None  # (N, 3) that the policy was asked for in this step, None where it was not
-        self.raw: Array | None = None  # its answer (N, A), before every limit
+        self.applied = np.zeros((robot.modules, robot.action_size))
+        self.target: Array | None = None  # (N, 3), input of the policy in this step; None without a computation
+        self.raw: Array | None = None  # (N, A), output of the policy, before the limits
 
     def compute(self, measured: Array | None, desired: Array, next_desired: Array) -> Array:
-        """The actuation (N, A) for this step, which is not in force before `record`.
+        """Computes the actuation (N, A) of this step; `record` confirms that it was applied.
 
-        measured: configuration (N, 3) at the start of the step, or None without a valid frame: the actuation in force
-        is held. desired, next_desired: desired configurations (N, 3) at the start and at the end of the step. Raises
-        `ModelError` for an answer that is not finite or far out of [-1, 1].
+        measured: configuration (N, 3) at the start of the step, or None without a valid frame, which holds the applied
+        actuation. desired, next_desired: desired configurations (N, 3) at the start and at the end of the step. Raises
+        `ModelError` if the policy's output is not finite or far outside [-1, 1].
         """
         kind = self._robot.kind
         if measured is not None:
@@ -60,13 +61,12 @@ class Controller:
         return actuation
 
     def record(self, actuation: Array) -> None:
-        """Ends the step with the actuation (N, A) that is in force: the computed one, or the one before where it was
-        not sent."""
+        """Ends the step. actuation (N, A): the computed one, or the previous one if the computed one was not sent."""
         self.applied = actuation
         self.window.applied(actuation)
         self.target = self.raw = None
 
     def skip(self) -> None:
-        """A step that passed without a computation: the last state counts again, the actuation is held."""
+        """Records a step without a computation: the last state is repeated, the actuation is held."""
         self.window.observe(self._state)
         self.window.applied(self.applied)

@@ -1,9 +1,8 @@
-"""Online correction around the network: the accumulated configuration error shifts what the network is asked for.
+"""Integral control around the network: the accumulated configuration error shifts the reference of the network.
 
-The network is an inverse of the robot; where it is a little wrong, or the robot is not the one it was trained on, its
-error is nearly the same from one period to the next. With the sum of the errors so far added to the desired
-configuration the network stays as it is and the error goes to zero all the same: integral control in the network's own
-coordinates.
+The network is an inverse model of the robot. Where the model is inaccurate, or the robot differs from the one in the
+training data, the error changes little from one period to the next. Adding the sum of past errors to the desired
+configuration removes it without a change of the network.
 """
 
 from __future__ import annotations
@@ -16,66 +15,66 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.choices import CORRECTIONS
 from modsoft.runtime.errors import UsageError
 
-# How much of an error that stays the same is taken off in each period. Chosen on random smooth references of four and
-# six modules, never on the tasks that are reported: more takes off more, but from 0.5 on some robots of six modules
-# swing at the edge of their workspace. With 0.5 degrees of noise 0.3 leaves less than 0.5 does.
+# Fraction of a constant error that is removed in each period. Tuned on random smooth references of four and six
+# modules, not on the reported tasks. A larger gain removes more, but from 0.5 some robots of six modules oscillate at
+# the edge of their workspace. With 0.5 degrees of noise the error is smaller at 0.3 than at 0.5.
 GAIN = 0.4
-LARGEST_SHIFT = 0.4  # of the unit vector
-ANTI_WINDUP_DECAY = 0.5  # of the sum, in each period in which a module cannot do more
+LARGEST_SHIFT = 0.4  # norm, relative to the unit vectors
+ANTI_WINDUP_DECAY = 0.5  # fraction of the sum that is dropped in each period in which a module saturates
 
 
 class Correction(Protocol):
-    """What stands between the task and the network for one run."""
+    """Corrects the reference of the network; one object for each run."""
 
-    def shifted(self, ahead: Array, desired: Array, measured: Array) -> Array:
-        """What the network is asked for, (N, 3) unit vectors: `ahead` is desired at the end of this period, `desired`
-        was at its start, where the robot is `measured`, all (N, 3)."""
+    def shifted(self, next_desired: Array, desired: Array, measured: Array) -> Array:
+        """The shifted reference (N, 3), unit vectors. next_desired, desired: desired configurations (N, 3) at the end
+        and at the start of this period; measured: configuration (N, 3) at its start."""
         ...
 
     def record_output(self, raw: Array, applied: Array) -> None:
-        """The network's answer `raw` (N, A), and what is applied of it after every limit."""
+        """Takes the network's output `raw` (N, A) and the `applied` actuation (N, A), after all limits."""
         ...
 
 
 class NoCorrection:
-    """The network alone."""
+    """Passes the reference on unchanged."""
 
-    def shifted(self, ahead: Array, desired: Array, measured: Array) -> Array:
-        return np.asarray(ahead)
+    def shifted(self, next_desired: Array, desired: Array, measured: Array) -> Array:
+        return np.asarray(next_desired)
 
     def record_output(self, raw: Array, applied: Array) -> None:
         pass
 
 
 class IntegralCorrection:
-    """Integral control of each module's configuration; made anew for every run."""
+    """Integral control of each module's configuration."""
 
     def __init__(self, modules: int, gain: float = GAIN, largest: float = LARGEST_SHIFT):
         self.gain, self.largest = gain, largest
         self.sum = np.zeros((modules, 3))
-        self._held = np.zeros(modules, dtype=bool)  # modules whose last answer did not go out as it was
+        self._saturated = np.zeros(modules, dtype=bool)  # modules whose last output was limited
 
-    def shifted(self, ahead: Array, desired: Array, measured: Array) -> Array:
-        ahead = np.asarray(ahead)
+    def shifted(self, next_desired: Array, desired: Array, measured: Array) -> Array:
+        next_desired = np.asarray(next_desired)
         error = np.asarray(desired) - measured
-        # Anti-windup at the unit sphere: what points out of it asks for nothing that a module can do, but would have
-        # to be undone when the desired configuration turns.
-        summed = _across(self.sum + self.gain * error, ahead)
-        size = np.linalg.norm(summed, axis=-1, keepdims=True)
-        summed *= np.minimum(1.0, self.largest / np.maximum(size, 1e-12))
-        # Anti-windup at saturation: a module that cannot do more lets go of its sum. Beyond what can be reached the
-        # network alone errs less than with a sum that was held from where it still could: a quarter less at the tip.
+        # Anti-windup at the unit sphere: a component along the reference has no effect, but would have to be removed
+        # when the reference turns.
+        summed = _tangential(self.sum + self.gain * error, next_desired)
+        norm = np.linalg.norm(summed, axis=-1, keepdims=True)
+        summed *= np.minimum(1.0, self.largest / np.maximum(norm, 1e-12))
+        # Anti-windup at saturation: the sum decays. For references out of reach the network alone has a smaller error
+        # (a quarter less at the tip) than with the sum held at its value before saturation.
         grows = np.linalg.norm(summed, axis=-1) > np.linalg.norm(self.sum, axis=-1)
-        self.sum = np.where((self._held & grows)[:, None], (1.0 - ANTI_WINDUP_DECAY) * self.sum, summed)
-        shifted = ahead + self.sum
+        self.sum = np.where((self._saturated & grows)[:, None], (1.0 - ANTI_WINDUP_DECAY) * self.sum, summed)
+        shifted = next_desired + self.sum
         return shifted / np.linalg.norm(shifted, axis=-1, keepdims=True)
 
     def record_output(self, raw: Array, applied: Array) -> None:
-        self._held = np.any(raw != applied, axis=-1)
+        self._saturated = np.any(raw != applied, axis=-1)
 
 
-def _across(vectors: Array, directions: Array) -> Array:
-    """The part of vectors (N, 3) that is at right angles to the unit vectors `directions` (N, 3)."""
+def _tangential(vectors: Array, directions: Array) -> Array:
+    """Components of vectors (N, 3) perpendicular to the unit vectors `directions` (N, 3)."""
     return vectors - np.sum(vectors * directions, axis=-1, keepdims=True) * directions
 
 

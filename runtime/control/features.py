@@ -1,7 +1,7 @@
-"""Poses to module configurations, and `Window`: the one feature layout of the network (eq. 1, S_d and history).
+"""Module configurations from poses, and the feature layout of the network (`Window`: history, S_d, label of eq. 1).
 
-A configuration is the unit tangent d3 of a module's end in the frame of the end of the module before it (module 1:
-the base), stored [v_x, v_y, v_z]. The network's state is the part of it that the robot's kind names, in that order.
+A configuration is the unit tangent d3 at a module's end, in the frame of the previous module's end (module 1: of the
+base), as [v_x, v_y, v_z]. The state of the network consists of the components that the robot's `Kind` lists.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.robot import KINDS
 
 COMPONENTS = ("v_x", "v_y", "v_z")
-REST_LIMIT_DEG = 60.0  # a module that is bent further does not hang at rest
+REST_LIMIT_DEG = 60.0  # largest bending angle of a module at rest
 _STATE_INDEX = {name: [COMPONENTS.index(component) for component in kind.state] for name, kind in KINDS.items()}
 
 
 def from_directors(directors: Array, base: Array | None = None) -> Array:
-    """Directors of the module ends, (..., N, 3, 3) with rows d1, d2, d3 in one common frame, to configurations
-    (..., N, 3). `base` (3, 3) is the base's frame, rows likewise; the common frame itself by default."""
+    """Configurations (..., N, 3) from directors of the module ends (..., N, 3, 3), rows d1, d2, d3 in a common frame.
+    base (3, 3): directors of the base, by default the common frame."""
     directors = np.asarray(directors, dtype=np.float64)
     first = np.broadcast_to(np.eye(3) if base is None else base, directors[..., :1, :, :].shape)
     before = np.concatenate([first, directors[..., :-1, :, :]], axis=-3)
@@ -26,59 +26,60 @@ def from_directors(directors: Array, base: Array | None = None) -> Array:
 
 
 def _in_frame(frames: Array, vectors: Array) -> Array:
-    """Components of vectors (..., 3) along the axes of frames (..., 3, 3), one axis a row."""
+    """Components of vectors (..., 3) along the axes of frames (..., 3, 3), whose rows are the axes."""
     vectors = vectors[..., None, :]
-    # Term by term: a dot product of numpy's may round differently for another number of robots.
+    # Written out, because rounding in numpy's dot product depends on the number of robots.
     return frames[..., 0] * vectors[..., 0] + frames[..., 1] * vectors[..., 1] + frames[..., 2] * vectors[..., 2]
 
 
 def from_poses(poses: Array) -> Array:
-    """Tracker poses (N + 1, 4, 4), base first, each a tool's axes (columns) and position in the tracker's frame, to
-    configurations (N, 3)."""
+    """Configurations (N, 3) from tracker poses (N + 1, 4, 4), base first: axes of each tool (columns) and its position
+    in the tracker's frame."""
     directors = np.asarray(poses, dtype=np.float64)[:, :3, :3].transpose(0, 2, 1)
     return _in_frame(directors[:-1], directors[1:, 2])
 
 
 def bending_angle_deg(configuration: Array) -> Array:
-    """Angle of a planar module (..., 3) in its plane of motion, degrees: atan2(v_x, v_z)."""
+    """Bending angle (...), degrees, of planar configurations (..., 3): atan2(v_x, v_z)."""
     configuration = np.asarray(configuration)
     return np.degrees(np.arctan2(configuration[..., 0], configuration[..., 2]))
 
 
 def bending_error_deg(configuration: Array, desired: Array) -> Array:
-    """Distance (...), 0 to 180 degrees, between the bending angles of two planar configurations (..., 3)."""
-    off = bending_angle_deg(configuration) - bending_angle_deg(desired)
-    return np.abs((off + 180.0) % 360.0 - 180.0)
+    """Difference (...), 0 to 180 degrees, between the bending angles of two planar configurations (..., 3)."""
+    difference = bending_angle_deg(configuration) - bending_angle_deg(desired)
+    return np.abs((difference + 180.0) % 360.0 - 180.0)
 
 
 def angle_between_deg(one: Array, other: Array) -> Array:
-    """Angle (...) between unit vectors (..., 3), degrees, exact for small angles too."""
+    """Angle (...), degrees, between unit vectors (..., 3); accurate for small angles."""
     (x, y, z), (u, v, w) = (np.moveaxis(np.asarray(vectors), -1, 0) for vectors in (one, other))
-    across_x, across_y, across_z = y * w - z * v, z * u - x * w, x * v - y * u  # np.cross takes three times as long
-    across = np.sqrt(across_x * across_x + across_y * across_y + across_z * across_z)
-    return np.degrees(np.arctan2(across, x * u + y * v + z * w))
+    cross_x, cross_y, cross_z = y * w - z * v, z * u - x * w, x * v - y * u  # three times as fast as np.cross
+    sine = np.sqrt(cross_x * cross_x + cross_y * cross_y + cross_z * cross_z)
+    return np.degrees(np.arctan2(sine, x * u + y * v + z * w))
 
 
 def from_angles_deg(angles: Array) -> Array:
-    """The inverse of `bending_angle_deg`: planar configurations (..., 3) of bending angles (...), degrees."""
+    """Planar configurations (..., 3) from bending angles (...), degrees: the inverse of `bending_angle_deg`."""
     radians = np.radians(angles)
     return np.stack([np.sin(radians), np.zeros_like(radians), np.cos(radians)], axis=-1)
 
 
 def state_of(configuration: Array, kind: str) -> Array:
-    """The network's state (..., S) of a kind of robot out of configurations (..., 3)."""
+    """State (..., S) of the network, for a kind of robot, from configurations (..., 3)."""
     return np.asarray(configuration)[..., _STATE_INDEX[kind]]
 
 
 def labels(modules: int) -> Array:
-    """Module labels (N,), eq. (1): n_i = 2 (i - 1) / (N - 1) - 1, from -1 at the base to +1 at the tip."""
+    """Module labels (N,), eq. (1): n_i = 2 (i - 1) / (N - 1) - 1, from -1 at the base to +1 at the tip. ValueError for
+    fewer than two modules."""
     if modules < 2:
-        raise ValueError(f"eq. (1) gives no label to a robot of {modules} module; at least 2")
+        raise ValueError(f"found {modules} modules, expected at least 2: eq. (1) divides by N - 1")
     return 2.0 * np.arange(modules) / (modules - 1) - 1.0
 
 
 def feature_names(kind: str, history: int) -> list[str]:
-    """The F = T (S + A) + 1 features of a module at control step t, in order. T = `history` time steps."""
+    """Names of the F = T (S + A) + 1 features of a module at control step t, in order; history: time steps T."""
     names = []
     for slot in range(history):
         state, action = slot - history + 2, slot - history
@@ -91,7 +92,7 @@ def feature_names(kind: str, history: int) -> list[str]:
 def features(states: Array, actions: Array) -> Array:
     """The features (..., N, F) of one control step t.
 
-    states (..., T, N, S): steps t - T + 2 to t, then the desired state (in training: the one really reached);
+    states (..., T, N, S): steps t - T + 2 to t, then the desired state (in training: the state reached);
     actions (..., T, N, A): steps t - T to t - 1.
     """
     slots = np.moveaxis(np.concatenate([states, actions], axis=-1), -3, -2)  # (..., N, T, S + A)
@@ -101,14 +102,14 @@ def features(states: Array, actions: Array) -> Array:
 
 
 class Window:
-    """The history that the loop keeps: T - 1 measured states and T applied actions, before a step all at rest."""
+    """Feature window of the control loop: T - 1 measured states and T applied actions."""
 
     def __init__(self, history: int, state: Array, action_size: int):
-        """`state` (N, S): the robot's state at rest, which fills the history together with zero actions."""
+        """Fills the history with `state` (N, S), the state at rest, and zero actions."""
         state = np.asarray(state, dtype=np.float64)
         modules, size = state.shape
         self._rows = features(np.stack([state] * history), np.zeros((history, modules, action_size)))
-        slots = self._rows[:, :-1].reshape(modules, history, size + action_size)  # a view: what it gets, the rows get
+        slots = self._rows[:, :-1].reshape(modules, history, size + action_size)  # a view of the rows
         self._measured = slots[:, :-1, :size]
         self._actions = slots[:, :, size:]
         self._desired = slice((history - 1) * (size + action_size), history * size + (history - 1) * action_size)
@@ -126,14 +127,14 @@ class Window:
         return rows
 
     def applied(self, action: Array) -> None:
-        """Appends the action (N, A) that was really sent in this step, after every limit."""
+        """Appends the action (N, A) applied in this step, after all limits."""
         self._actions[:, :-1] = self._actions[:, 1:]
         self._actions[:, -1] = action
 
 
 def episode_features(states: Array, actions: Array, history: int) -> Array:
-    """The features (K, N, F) of every step of an episode that starts at rest: states (K + 1, N, S), actions
-    (K, N, A). Row t has the action of step t as its target. Equal to a `Window` fed step by step (tested)."""
+    """Features (K, N, F) of all steps of an episode that starts at rest, from states (K + 1, N, S) and actions
+    (K, N, A). The action of step t is the target of row t. Equal to a `Window` that is updated in each step."""
     steps = len(actions)
     states = np.concatenate([np.repeat(states[:1], history - 2, axis=0), states]) if history > 2 else states
     actions = np.concatenate([np.zeros((history, *actions.shape[1:])), actions[:-1]])

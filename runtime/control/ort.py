@@ -1,5 +1,5 @@
-"""onnxruntime without its telemetry, which writes a device's identity below the home and sends events. It reads the
-setting when it is imported, so this is the only module that imports it."""
+"""onnxruntime with its telemetry disabled, which would write a device identity below the home and send events. The
+setting takes effect at import, so no other module imports onnxruntime."""
 
 import os
 

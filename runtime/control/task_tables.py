@@ -1,13 +1,14 @@
-"""How far each module bends in the tasks of the cable robot: the paper's tables, and their like for other robots.
+"""Bending of each module in the tasks of the cable robot: the paper's tables, and tables for other robots.
 
-The supplement (S1 to S4) gives four and six modules. Its tables are alike when counted from the tip: the last modules
-bend as far as a module can, those before them ever less, and however long the robot is the whole bend of task A stays
-at 140 to 146 degrees; in task C the tip module bends back by what the others bend, so that the tip's orientation is
-kept, and in task B by four to five times as much, so that its position nearly is. Other robots follow that: up to five
-modules the table of four, above it that of six, counted from the tip; a longer robot repeats the base module. In A the
-whole bend so becomes 95, 127, 152, 153 and 167 degrees for 2, 3, 5, 8 and 12 modules (each at v_z >= 0.625: two or
-three modules cannot bend by 140); in B and C the modules that do not bend back are scaled to bend by what they do
-together in the paper's robot (B), by what the tip module bends back (C).
+The supplement (S1 to S4) lists four and six modules. Counted from the tip, its tables have the same pattern. The last
+modules bend to their limit and those before them less; the angles of task A sum up to 140 to 146 degrees. In task C
+the tip module bends back by the sum of the others, which keeps the orientation of the tip. In task B it bends back by
+four to five times as much, which nearly keeps its position.
+
+Other robots take the table of four modules (up to N = 5) or of six (above), counted from the tip; a longer robot
+repeats the base module. The angles of task A then sum up to 95, 127, 152, 153 and 167 degrees for 2, 3, 5, 8 and 12
+modules (with v_z >= 0.625, two or three modules cannot reach 140). In B and C the angles of the modules that do not
+bend back are scaled: in B to their sum in the paper's robot, in C to the angle of the tip module.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ import numpy as np
 
 from modsoft.runtime.arrays import Array
 
-PAPERS = (4, 6)
-# Smallest v_z of each module, base first (A); v_z and amplitude (B); both (C).
+PAPER_MODULES = (4, 6)
+# Of each module, base first: smallest v_z (A), v_z and direction (B, C).
 SPIRAL_V_Z = {4: [0.975, 0.850, 0.725, 0.625], 6: [0.998, 0.995, 0.950, 0.850, 0.800, 0.650]}
 CIRCLE_V_Z = {4: [0.998, 0.998, 0.996, 0.600], 6: [0.999, 0.999, 0.999, 0.998, 0.995, 0.708]}
 CIRCLE_SIGN = {4: [1, 1, 1, -1], 6: [1, 1, 1, 1, -1, -1]}
@@ -29,44 +30,44 @@ BEND_SIGN = {4: [1, 1, 1, -1], 6: [1, 1, 1, 1, 1, -1]}
 
 @dataclass(frozen=True)
 class Bend:
-    """v_z (N,) and the sign (N,) of the direction of each module, base first."""
+    """v_z (N,) and sign (N,) of the bending direction of each module, base first."""
 
     v_z: Array
     sign: Array
 
 
 def spiral(modules: int) -> Bend:
-    """Task A: the smallest v_z, reached at the end."""
+    """Task A: smallest v_z, reached at the end."""
     return Bend(_from_the_tip(SPIRAL_V_Z, modules), np.ones(modules))
 
 
 def circle(modules: int) -> Bend:
-    """Task B: v_z of the whole task."""
+    """Task B: v_z, constant over the task."""
     v_z, sign = _from_the_tip(CIRCLE_V_Z, modules), _from_the_tip(CIRCLE_SIGN, modules)
-    papers = _papers(modules)
-    whole_rad = np.arccos(CIRCLE_V_Z[papers])[np.array(CIRCLE_SIGN[papers]) > 0].sum()
-    return Bend(v_z, sign) if modules in PAPERS else _scaled(v_z, sign, whole_rad)
+    table = _table_size(modules)
+    sum_rad = np.arccos(CIRCLE_V_Z[table])[np.array(CIRCLE_SIGN[table]) > 0].sum()
+    return Bend(v_z, sign) if modules in PAPER_MODULES else _scaled(v_z, sign, sum_rad)
 
 
 def bend(modules: int) -> Bend:
-    """Task C: the v_z that the turn is made at."""
+    """Task C: v_z during the turn."""
     v_z, sign = _from_the_tip(BEND_V_Z, modules), _from_the_tip(BEND_SIGN, modules)
-    return Bend(v_z, sign) if modules in PAPERS else _scaled(v_z, sign, np.arccos(v_z[-1]))
+    return Bend(v_z, sign) if modules in PAPER_MODULES else _scaled(v_z, sign, np.arccos(v_z[-1]))
 
 
-def _papers(modules: int) -> int:
+def _table_size(modules: int) -> int:
     return 6 if modules >= 6 else 4
 
 
 def _from_the_tip(table: dict[int, list[float]] | dict[int, list[int]], modules: int) -> Array:
-    """The nearest table, cut at the base or with its base repeated, to (N,)."""
-    row = np.array(table[_papers(modules)], dtype=np.float64)
+    """Row (N,) of the nearest table, cut at the base or with its base module repeated."""
+    row = np.array(table[_table_size(modules)], dtype=np.float64)
     return np.concatenate([np.repeat(row[:1], max(0, modules - len(row))), row[-modules:]])
 
 
-def _scaled(v_z: Array, sign: Array, whole_rad: float) -> Bend:
-    """The angles of the modules that do not bend back scaled to sum up to `whole_rad`."""
+def _scaled(v_z: Array, sign: Array, sum_rad: float) -> Bend:
+    """Scales the angles of the modules that do not bend back, so that their sum is `sum_rad`."""
     angle_rad = np.arccos(v_z)
-    ahead = sign > 0
-    angle_rad[ahead] *= whole_rad / angle_rad[ahead].sum()
-    return Bend(np.where(ahead, np.cos(angle_rad), v_z), sign)
+    forward = sign > 0
+    angle_rad[forward] *= sum_rad / angle_rad[forward].sum()
+    return Bend(np.where(forward, np.cos(angle_rad), v_z), sign)

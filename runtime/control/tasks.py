@@ -1,7 +1,7 @@
-"""The tasks: desired configurations over the control steps, from the paper's supplement (S1 to S5).
+"""Tasks: desired configurations over the control steps, from the paper's supplement (S1 to S5).
 
-The supplement prints 3.24 degrees for `down` with two modules, which contradicts its own text ("about 30 degrees",
-angles that sum to zero); 32.4 is taken.
+The supplement prints 3.24 degrees for `down` with two modules. That contradicts its text ("about 30 degrees", angles
+with a sum of zero), so 32.4 is used.
 """
 
 from __future__ import annotations
@@ -32,51 +32,52 @@ def _turn(phase: Array, v_z: Array, sign: Array) -> Array:
     return np.stack([np.sin(phase)[:, None] * side, np.cos(phase)[:, None] * side, v_z], axis=-1)
 
 
-def task_a(least: Bend) -> Array:
-    """S1: all modules turn once while they bend ever further."""
+def task_a(smallest: Bend) -> Array:
+    """S1: all modules turn once while their bending increases."""
     t = np.arange(SIMULATED_STEPS) / SIMULATED_STEPS
-    return _turn(2 * np.pi * t, 1.0 - (1.0 - least.v_z) * t[:, None], least.sign)
+    return _turn(2 * np.pi * t, 1.0 - (1.0 - smallest.v_z) * t[:, None], smallest.sign)
 
 
-def task_b(held: Bend) -> Array:
-    """S2: one turn at constant bend; the first step is a jump from rest."""
+def task_b(constant: Bend) -> Array:
+    """S2: one turn at constant bending; starts with a jump from rest."""
     t = np.arange(SIMULATED_STEPS) / SIMULATED_STEPS
-    return _turn(2 * np.pi * t, np.broadcast_to(held.v_z, (SIMULATED_STEPS, len(held.v_z))), held.sign)
+    return _turn(2 * np.pi * t, np.broadcast_to(constant.v_z, (SIMULATED_STEPS, len(constant.v_z))), constant.sign)
 
 
-def task_c(least: Bend) -> Array:
+def task_c(smallest: Bend) -> Array:
     """S3, S4: 50 steps of bending in y, then one turn."""
     t = np.arange(SIMULATED_STEPS)
-    v_z = 1.0 - (1.0 - least.v_z) * np.minimum(t / 50, 1.0)[:, None]
-    return _turn(2 * np.pi * np.maximum(t - 50, 0) / 200, v_z, least.sign)
+    v_z = 1.0 - (1.0 - smallest.v_z) * np.minimum(t / 50, 1.0)[:, None]
+    return _turn(2 * np.pi * np.maximum(t - 50, 0) / 200, v_z, smallest.sign)
 
 
 def task_planar(largest_deg: list[float]) -> Array:
-    """S5: every angle rises to its largest value, crosses to the opposite one, and comes back."""
+    """S5: every angle rises to its largest value, falls to the opposite one, and returns to 0."""
     t = np.arange(REAL_STEPS)
-    share = np.where(t < 50, t / 50, np.where(t < 150, 2 - t / 50, t / 50 - 4))
-    return from_angles_deg(share[:, None] * np.asarray(largest_deg))
+    fraction = np.where(t < 50, t / 50, np.where(t < 150, 2 - t / 50, t / 50 - 4))
+    return from_angles_deg(fraction[:, None] * np.asarray(largest_deg))
 
 
 def next_reference(desired: Array) -> Array:
-    """What the network is asked for at each step (K, N, 3): S_d of eq. (1) is the state at the end of the period, which
-    is desired at the start of the next. The last period ends where the task does."""
+    """Reference of the network at each step (K, N, 3): S_d of eq. (1) is the desired state at the end of the period,
+    which is `desired` (K, N, 3) at the start of the next one. The last configuration is repeated."""
     return np.concatenate([desired[1:], desired[-1:]])
 
 
 def available(kind: str, modules: int) -> list[str]:
-    """Names of the tasks for such a robot. Those of a cable robot that the paper does not have are like the paper's."""
+    """Names of the tasks for a kind of robot and a number of modules."""
     if kind == "cable":
         return ["A", "B", "C"]
     return ["edge", "down"] if modules in EDGE_DEG else []
 
 
 def task(name: str, kind: str, modules: int) -> Array:
-    """Desired configurations (steps, N, 3), [v_x, v_y, v_z]; row k is the target at the start of control step k."""
+    """Desired configurations (steps, N, 3), [v_x, v_y, v_z], at the start of each control step. `UsageError` for an
+    unknown name."""
     if name not in available(kind, modules):
-        known = ", ".join(available(kind, modules)) or "none by name"
+        names = "".join(f"{each}, " for each in available(kind, modules))
         raise UsageError(
-            f"no task {name!r} for a {kind} robot of {modules} modules; known: {known}; or give a .npy file with "
+            f"no task {name!r} for a {kind} robot of {modules} modules; expected {names}or a .npy file with "
             f"desired configurations (steps, {modules}, 3), [v_x, v_y, v_z]"
         )
     match name:
@@ -93,7 +94,7 @@ def task(name: str, kind: str, modules: int) -> Array:
 
 
 def task_of(robot: Robot, folder: Path) -> str:
-    """The task under [loop], as `load_task` takes it; `folder`: where the robot file's paths start from."""
+    """The task under [loop], in the form for `load_task`; folder: base of the relative paths in the robot file."""
     task = robot.loop.task
     return str(folder / task) if _is_file_name(task) else task
 
@@ -103,11 +104,11 @@ def _is_file_name(task: str) -> bool:
 
 
 def load_task(name_or_file: str, robot: Robot) -> Array:
-    """A task by its name, or from a .npy file of unit vectors (steps, N, 3)."""
+    """Loads a task by its name, or from a .npy file of unit vectors (steps, N, 3). `UsageError` for anything else."""
     if not _is_file_name(name_or_file):
         return task(name_or_file, robot.kind, robot.modules)
     if Path(name_or_file).is_dir():
-        raise UsageError(f"task file {name_or_file} is a folder; give an existing .npy file or a task's name")
+        raise UsageError(f"task file {name_or_file} is a folder; give a .npy file or a task's name")
     if not Path(name_or_file).is_file():
         raise UsageError(f"no task file {name_or_file!r}; give an existing .npy file or a task's name")
     try:
@@ -115,9 +116,9 @@ def load_task(name_or_file: str, robot: Robot) -> Array:
     except OSError as error:
         raise UsageError(f"task file {name_or_file}: cannot be read ({error.strerror or error})") from error
     except NOT_AN_ARRAY as error:
-        # Without numpy's own words: they advise to load the file unsafely.
+        # Without numpy's message, which advises to load the file unsafely.
         raise UsageError(
-            f"task file {name_or_file}: not a readable .npy array of floats: damaged, or of another format; "
+            f"task file {name_or_file}: not a readable .npy array of floats (damaged, or another format); "
             "write it again with numpy.save"
         ) from error
     if not isinstance(desired, np.ndarray):

@@ -1,4 +1,4 @@
-"""Eq. (3), the limits on the actuation, and what the board is sent."""
+"""Eq. (3), the limits of the actuation, and the set-points of the board."""
 
 import numpy as np
 from hypothesis import given
@@ -17,7 +17,7 @@ def test_cables_pull_in_the_order_0_180_90_270_degrees():
 
 
 @given(ACTIONS)
-def test_opposite_chambers_never_push_together(action):
+def test_one_of_two_opposite_chambers_is_inactive(action):
     pair = actuation.activations(action)
     assert np.all(np.min(pair, axis=-1) == 0)
     assert np.array_equal(pair[:, :1] - pair[:, 1:], action)
@@ -29,17 +29,17 @@ def test_pressure_is_linear_in_the_activation():
 
 
 @given(ACTIONS, ACTIONS, st.floats(0.01, 2))
-def test_limited_stays_within_the_step_and_the_range(wanted, before, step):
-    out = actuation.limited(wanted * 3, before, step)
+def test_limited_actuation_is_within_range_and_step(requested, before, step):
+    out = actuation.limited(requested * 3, before, step)
     assert np.all(np.abs(out) <= 1)
     assert np.all(np.abs(out - before) <= step + 1e-12)
 
 
-def test_a_reachable_actuation_is_not_changed():
+def test_actuation_within_the_limits_is_unchanged():
     assert np.array_equal(actuation.limited([[0.5]], [[0.4]], 0.2), [[0.5]])
 
 
-def test_channels_carry_gain_and_offset_and_nothing_else():
+def test_set_points_include_gain_and_offset():
     table = ROBOT.to_dict()
     table["chambers"][0].update(channel=10, gain=0.5, offset_bar=0.01)
     out = actuation.channel_pressures_bar(robot.from_dict(table), np.array([[1.0], [-1.0], [0.0]]))
@@ -48,7 +48,7 @@ def test_channels_carry_gain_and_offset_and_nothing_else():
     np.testing.assert_allclose(out, expected)
 
 
-def test_no_correction_exceeds_the_largest_pressure():
+def test_set_points_are_limited_to_the_pressure_range():
     table = ROBOT.to_dict()
     table["chambers"][0].update(gain=2.0)
     table["chambers"][1].update(offset_bar=-0.1)

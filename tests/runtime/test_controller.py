@@ -1,4 +1,4 @@
-"""The control step: what is asked for, what is held, what is remembered."""
+"""The control step: reference, limits, hold and history."""
 
 import numpy as np
 import pytest
@@ -16,57 +16,57 @@ NEXT = from_angles_deg(np.array([5.0, 10.0, -20.0]))
 
 
 class Policy:
-    """Gives one answer always, and keeps the features."""
+    """Returns a constant output and stores the features."""
 
     history = 3
 
-    def __init__(self, answer):
-        self.answer, self.seen = np.asarray(answer, dtype=float).reshape(3, 1), []
+    def __init__(self, output):
+        self.output, self.features = np.asarray(output, dtype=float).reshape(3, 1), []
 
     def actuate(self, features):
-        self.seen.append(features.copy())
-        return self.answer
+        self.features.append(features.copy())
+        return self.output
 
 
-def test_a_step_asks_for_the_next_desired_configuration_and_limits_the_answer():
+def test_step_uses_the_next_desired_configuration_and_limits_the_output():
     policy = Policy([0.5, 1.5, -1.5])
     controller = Controller(ROBOT, policy, REST)
     measured = from_angles_deg(np.array([1.0, 2.0, 3.0]))
     actuation = controller.compute(measured, REST, NEXT)
     np.testing.assert_array_equal(actuation, [[0.5], [0.8], [-0.8]])
     np.testing.assert_array_equal(controller.target, NEXT)
-    np.testing.assert_array_equal(controller.raw, policy.answer)
+    np.testing.assert_array_equal(controller.raw, policy.output)
     window = Window(3, state_of(REST, "pneumatic"), 1)
     window.observe(state_of(measured, "pneumatic"))
-    np.testing.assert_array_equal(policy.seen[0], window.features(state_of(NEXT, "pneumatic")))
-    np.testing.assert_array_equal(controller.applied, np.zeros((3, 1)))  # not in force before it is recorded
+    np.testing.assert_array_equal(policy.features[0], window.features(state_of(NEXT, "pneumatic")))
+    np.testing.assert_array_equal(controller.applied, np.zeros((3, 1)))  # until it is recorded
     controller.record(actuation)
     np.testing.assert_array_equal(controller.applied, actuation)
     assert controller.target is controller.raw is None
 
 
-@pytest.mark.parametrize("passed", ["no valid frame", "skipped"])
-def test_without_a_measurement_state_and_actuation_are_held(passed):
+@pytest.mark.parametrize("cause", ["no valid frame", "skipped"])
+def test_state_and_actuation_are_held_without_a_measurement(cause):
     policy = Policy([0.1, 0.2, 0.3])
     controller = Controller(ROBOT, policy, REST)
     first = from_angles_deg(np.array([1.0, 2.0, 3.0]))
     controller.record(controller.compute(first, REST, NEXT))
-    if passed == "skipped":
+    if cause == "skipped":
         controller.skip()
     else:
         controller.record(controller.compute(None, REST, NEXT))
-    assert len(policy.seen) == 1
-    np.testing.assert_array_equal(controller.applied, policy.answer)
+    assert len(policy.features) == 1
+    np.testing.assert_array_equal(controller.applied, policy.output)
     controller.compute(REST, REST, NEXT)
     window = Window(3, state_of(REST, "pneumatic"), 1)
     for _ in range(2):
         window.observe(state_of(first, "pneumatic"))
-        window.applied(policy.answer)
+        window.applied(policy.output)
     window.observe(state_of(REST, "pneumatic"))
-    np.testing.assert_array_equal(policy.seen[1], window.features(state_of(NEXT, "pneumatic")))
+    np.testing.assert_array_equal(policy.features[1], window.features(state_of(NEXT, "pneumatic")))
 
 
-def test_an_actuation_that_is_not_sent_is_not_remembered():
+def test_actuation_that_was_not_sent_is_not_recorded():
     policy = Policy([0.1, 0.2, 0.3])
     controller = Controller(ROBOT, policy, REST)
     controller.compute(REST, REST, NEXT)
@@ -74,9 +74,9 @@ def test_an_actuation_that_is_not_sent_is_not_remembered():
     np.testing.assert_array_equal(controller.applied, np.zeros((3, 1)))
 
 
-@pytest.mark.parametrize("answer", [np.nan, 3.5])
-def test_an_answer_far_out_of_range_is_refused_and_kept_for_the_log(answer):
-    controller = Controller(ROBOT, Policy([0.0, answer, 0.0]), REST)
+@pytest.mark.parametrize("output", [np.nan, 3.5])
+def test_output_far_out_of_range_is_refused_and_kept_for_the_log(output):
+    controller = Controller(ROBOT, Policy([0.0, output, 0.0]), REST)
     with pytest.raises(ModelError, match="actuation is"):
         controller.compute(REST, REST, NEXT)
     assert controller.raw is not None

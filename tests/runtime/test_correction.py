@@ -1,4 +1,4 @@
-"""The correction on modules that reach what the network was asked for, but for an error of their own."""
+"""The correction, on modules that reach the reference of the network with a constant error."""
 
 import numpy as np
 import pytest
@@ -12,60 +12,60 @@ def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def driven(correction, desired, off, reach=lambda aim: aim):
-    """Distance (K, N), percent, of a robot that lands `off` (N, 3) beside what it is asked for."""
-    targets, measured, found = next_reference(desired), desired[0], []
+def errors_percent(correction, desired, offset, limit=lambda target: target):
+    """Tracking error (K, N), percent, of a robot that misses its reference by `offset` (N, 3)."""
+    references, measured, errors = next_reference(desired), desired[0], []
     for k in range(len(desired)):
-        found.append(100 * np.linalg.norm(measured - desired[k], axis=-1))
-        aim = correction.shifted(targets[k], desired[k], measured)
-        np.testing.assert_allclose(np.linalg.norm(aim, axis=-1), 1.0)
-        got = reach(aim)
-        correction.record_output(raw=aim[:, :2], applied=got[:, :2])
-        measured = unit(got + off)
-    return np.array(found)
+        errors.append(100 * np.linalg.norm(measured - desired[k], axis=-1))
+        target = correction.shifted(references[k], desired[k], measured)
+        np.testing.assert_allclose(np.linalg.norm(target, axis=-1), 1.0)
+        reached = limit(target)
+        correction.record_output(raw=target[:, :2], applied=reached[:, :2])
+        measured = unit(reached + offset)
+    return np.array(errors)
 
 
-OFF = np.array([[0.05, 0, 0], [0, -0.04, 0.01], [0.02, 0.03, 0], [-0.06, 0.02, 0]])
+OFFSET = np.array([[0.05, 0, 0], [0, -0.04, 0.01], [0.02, 0.03, 0], [-0.06, 0.02, 0]])
 
 
-def test_an_error_that_stays_is_taken_off():
+def test_constant_error_is_removed():
     desired = task("A", "cable", 4)
-    alone = driven(NoCorrection(), desired, OFF)
-    corrected = driven(IntegralCorrection(4), desired, OFF)
+    alone = errors_percent(NoCorrection(), desired, OFFSET)
+    corrected = errors_percent(IntegralCorrection(4), desired, OFFSET)
     assert alone[20:].min() > 2.0
     assert corrected[50:].max() < 0.1 * alone[50:].min()
 
 
-def test_without_an_error_nothing_is_changed():
+def test_reference_is_unchanged_without_an_error():
     desired = task("A", "cable", 4)
-    assert driven(IntegralCorrection(4), desired, 0 * OFF).max() < 1e-10
+    assert errors_percent(IntegralCorrection(4), desired, 0 * OFFSET).max() < 1e-10
 
 
-def test_the_shift_is_bounded_and_along_the_sphere():
+def test_shift_is_bounded_and_tangential_to_the_sphere():
     correction = IntegralCorrection(2, largest=0.2)
-    ahead_ = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
-    for _ in range(100):  # a robot that does not move at all
-        correction.shifted(ahead_, ahead_, np.array([[0.6, 0.0, 0.8], [0.0, 0.0, 1.0]]))
+    reference = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
+    for _ in range(100):  # a robot that does not move
+        correction.shifted(reference, reference, np.array([[0.6, 0.0, 0.8], [0.0, 0.0, 1.0]]))
     np.testing.assert_allclose(np.linalg.norm(correction.sum, axis=-1), 0.2)
-    np.testing.assert_allclose(np.sum(correction.sum * ahead_, axis=-1), 0.0, atol=1e-15)
+    np.testing.assert_allclose(np.sum(correction.sum * reference, axis=-1), 0.0, atol=1e-15)
 
 
-def test_a_saturated_module_does_not_wind_up():
-    """Desired beyond reach for 100 steps, then within it: nothing has to be undone."""
+def test_saturated_module_does_not_wind_up():
+    """The reference is out of reach for 100 steps, then within reach: no error is left from saturation."""
 
-    def reach(aim):
-        return unit(np.stack([np.clip(aim[:, 0], -0.5, 0.5), aim[:, 1], np.abs(aim[:, 2])], axis=-1))
+    def limit(target):
+        return unit(np.stack([np.clip(target[:, 0], -0.5, 0.5), target[:, 1], np.abs(target[:, 2])], axis=-1))
 
     angle = np.where(np.arange(200) < 100, 0.8, 0.3)[:, None]
     desired = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=-1)
-    still = driven(IntegralCorrection(1), desired, np.zeros((1, 3)), reach)
-    assert still[100:].max() < 1e-10
-    wound = IntegralCorrection(1)
-    wound.record_output = lambda raw, applied: None  # never told that it saturates
-    assert driven(wound, desired, np.zeros((1, 3)), reach)[101] > 5.0
+    errors = errors_percent(IntegralCorrection(1), desired, np.zeros((1, 3)), limit)
+    assert errors[100:].max() < 1e-10
+    without = IntegralCorrection(1)
+    without.record_output = lambda raw, applied: None  # anti-windup disabled
+    assert errors_percent(without, desired, np.zeros((1, 3)), limit)[101] > 5.0
 
 
-def test_a_saturated_module_lets_go_and_may_always_be_asked_for_less():
+def test_sum_decays_at_saturation_and_may_always_decrease():
     correction = IntegralCorrection(1)
     rest = np.array([[0.0, 0.0, 1.0]])
     correction.shifted(rest, rest, np.array([[-0.1, 0.0, 0.995]]))

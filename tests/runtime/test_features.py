@@ -9,7 +9,7 @@ from modsoft.runtime.control import features as c
 
 
 def rotation(axis: int, degrees: float) -> np.ndarray:
-    """Directors (rows) of a frame turned about one axis."""
+    """Directors (rows) of a frame rotated about one axis."""
     a = np.radians(degrees)
     i, j = [(1, 2), (2, 0), (0, 1)][axis]
     out = np.eye(3)
@@ -23,25 +23,25 @@ def random_frames(rng, *shape):
     return q * np.sign(np.linalg.det(q))[..., None, None]
 
 
-def test_straight_robot_points_along_z():
+def test_straight_robot_is_parallel_to_z():
     assert np.array_equal(c.from_directors(np.broadcast_to(np.eye(3), (4, 3, 3))), [[0, 0, 1]] * 4)
 
 
-def test_planar_chain_gives_its_own_angles():
+def test_planar_robot_has_the_given_bending_angles():
     angles = np.array([3.6, 36.0, -39.6])
     # about y: positive angles bend towards +x
     directors = np.stack([rotation(1, total) for total in np.cumsum(angles)])
-    found = c.from_directors(directors)
-    np.testing.assert_allclose(c.bending_angle_deg(found), angles, atol=1e-12)
-    np.testing.assert_allclose(found, c.from_angles_deg(angles), atol=1e-12)
+    configuration = c.from_directors(directors)
+    np.testing.assert_allclose(c.bending_angle_deg(configuration), angles, atol=1e-12)
+    np.testing.assert_allclose(configuration, c.from_angles_deg(angles), atol=1e-12)
 
 
-def test_poses_do_not_depend_on_where_the_tracker_stands():
+def test_configuration_is_independent_of_the_tracker_pose():
     rng = np.random.default_rng(1)
     directors = random_frames(rng, 4)
     turned = random_frames(rng)
     poses = np.zeros((4, 4, 4))
-    poses[:, :3, :3] = np.swapaxes(directors @ turned, -1, -2)  # the same robot seen from another place
+    poses[:, :3, :3] = np.swapaxes(directors @ turned, -1, -2)  # the same robot in the frame of another tracker
     poses[:, :3, 3] = rng.normal(size=(4, 3))
     np.testing.assert_allclose(c.from_poses(poses), c.from_directors(directors[1:], base=directors[0]), atol=1e-12)
 
@@ -64,10 +64,10 @@ def test_labels():
 
 
 def test_feature_order_by_name():
-    """Every feature carries the value that its name tells, for the one layout of the reference facts."""
+    """Each feature has the value that its name describes."""
     history, modules, kind = 5, 3, "cable"
     step = 40
-    # value = 1000 * step + 10 * module + component, distinct for each place
+    # 1000 * step + 10 * module + component: unique for each entry
     states = {t: np.array([[1000 * t + 10 * i + s for s in (1, 2, 3)] for i in range(modules)]) for t in range(60)}
     actions = {t: np.array([[1000 * t + 10 * i + s for s in (4, 5)] for i in range(modules)]) for t in range(60)}
     window = c.Window(history, states[step - history], 2)
@@ -75,16 +75,16 @@ def test_feature_order_by_name():
         window.observe(states[t])
         window.applied(actions[t])
     window.observe(states[step])
-    found = window.features(states[step + 1])
+    rows = window.features(states[step + 1])
     names = c.feature_names(kind, history)
-    assert found.shape == (modules, len(names)) == (3, 5 * 5 + 1)
+    assert rows.shape == (modules, len(names)) == (3, 5 * 5 + 1)
     order = {"v_z": 1, "v_x": 2, "v_y": 3, "a_0": 4, "a_1": 5}
     for i in range(modules):
-        for name, value in zip(names[:-1], found[i], strict=False):
+        for name, value in zip(names[:-1], rows[i], strict=False):
             component, at = name.rstrip("]").split("[")
             t = step + 1 if at == "desired" else step + int(at[1:] or 0)
             assert value == 1000 * t + 10 * i + order[component], name
-        assert found[i, -1] == c.labels(modules)[i]
+        assert rows[i, -1] == c.labels(modules)[i]
 
 
 @given(
@@ -93,7 +93,7 @@ def test_feature_order_by_name():
     steps=st.integers(1, 12),
     sizes=st.sampled_from([(3, 2), (2, 1)]),
 )
-def test_whole_episode_equals_window_step_by_step(history, modules, steps, sizes):
+def test_episode_features_equal_the_window_in_each_step(history, modules, steps, sizes):
     rng = np.random.default_rng(history + 10 * modules + 100 * steps)
     states = rng.normal(size=(steps + 1, modules, sizes[0]))
     actions = rng.normal(size=(steps, modules, sizes[1]))
@@ -106,12 +106,12 @@ def test_whole_episode_equals_window_step_by_step(history, modules, steps, sizes
     np.testing.assert_array_equal(c.episode_features(states, actions, history), np.stack(rows))
 
 
-def test_angles_between_vectors_are_exact_when_small():
+def test_angle_between_vectors_is_accurate_when_small():
     one = c.from_angles_deg(np.array([0.001, 90.0]))
-    found = c.angle_between_deg(one, c.from_angles_deg(np.array([0.0, -90.0])))
-    np.testing.assert_allclose(found, [0.001, 180.0], rtol=1e-9)
+    angles = c.angle_between_deg(one, c.from_angles_deg(np.array([0.0, -90.0])))
+    np.testing.assert_allclose(angles, [0.001, 180.0], rtol=1e-9)
 
 
-def test_bending_errors_go_the_short_way_round():
-    found = c.bending_error_deg(c.from_angles_deg(np.array([175.0, -10.0])), c.from_angles_deg(np.array([-175.0, 5.0])))
-    np.testing.assert_allclose(found, [10.0, 15.0])
+def test_bending_error_is_at_most_180_degrees():
+    first, second = c.from_angles_deg(np.array([175.0, -10.0])), c.from_angles_deg(np.array([-175.0, 5.0]))
+    np.testing.assert_allclose(c.bending_error_deg(first, second), [10.0, 15.0])

@@ -1,4 +1,4 @@
-"""The tasks of the supplement."""
+"""Tasks of the supplement, their tables for other robots, and task files."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from modsoft.runtime.errors import UsageError
     ("kind", "modules"),
     [*(("cable", modules) for modules in (2, 3, 4, 5, 6, 8, 12, 64)), ("pneumatic", 2), ("pneumatic", 3)],
 )
-def test_every_task_is_a_row_of_unit_vectors(kind, modules):
+def test_tasks_are_unit_vectors(kind, modules):
     for name in tasks.available(kind, modules):
         desired = tasks.task(name, kind, modules)
         assert desired.shape == (250 if kind == "cable" else 200, modules, 3)
@@ -42,22 +42,22 @@ def angles_deg(bend):
     return np.degrees(bend.sign * np.arccos(bend.v_z))
 
 
-def test_the_papers_robots_have_the_papers_tables():
+def test_paper_robots_use_the_tables_of_the_paper():
     for modules in (4, 6):
         assert task_tables.spiral(modules).v_z.tolist() == task_tables.SPIRAL_V_Z[modules]
-        for made, v_z, sign in [
+        for table, v_z, sign in [
             (task_tables.circle(modules), task_tables.CIRCLE_V_Z, task_tables.CIRCLE_SIGN),
             (task_tables.bend(modules), task_tables.BEND_V_Z, task_tables.BEND_SIGN),
         ]:
-            assert (made.v_z.tolist(), made.sign.tolist()) == (v_z[modules], sign[modules])
+            assert (table.v_z.tolist(), table.sign.tolist()) == (v_z[modules], sign[modules])
 
 
 @pytest.mark.parametrize("modules", [2, 3, 5, 7, 8, 12])
-def test_tasks_of_other_robots_are_of_the_papers_shape(modules):
+def test_tasks_of_other_robots_follow_the_pattern_of_the_paper(modules):
     spiral, circle, bend = (
         angles_deg(make(modules)) for make in (task_tables.spiral, task_tables.circle, task_tables.bend)
     )
-    assert all(np.abs(each).max() < 53.2 for each in (spiral, circle, bend))  # what the paper asks of a module
+    assert all(np.abs(each).max() < 53.2 for each in (spiral, circle, bend))  # largest angle in the paper
     assert (np.diff(spiral) >= 0).all()
     if modules > 4:
         assert 139 < spiral.sum() < 170
@@ -70,30 +70,30 @@ def test_tasks_of_other_robots_are_of_the_papers_shape(modules):
 
 
 @pytest.mark.parametrize("modules", [2, 3, 5, 8, 12])
-def test_the_tip_stays_near_the_axis_in_task_b_and_upright_in_task_c(modules):
-    """Modules as arcs of equal length in one plane: as far from the axis as the paper's robots, over the length, or
-    little farther."""
+def test_tip_stays_near_the_axis_in_task_b_and_upright_in_task_c(modules):
+    """With modules as arcs of equal length in one plane. The distance of the tip from the axis, relative to the length
+    of the robot, is about that of the paper's robots."""
     ends_rad = np.radians(np.cumsum(angles_deg(task_tables.circle(modules))))
     starts_rad = np.concatenate([[0.0], ends_rad[:-1]])
-    aside = (np.cos(starts_rad) - np.cos(ends_rad)) / (ends_rad - starts_rad)
-    assert abs(aside.sum() / modules) < 0.08
+    lateral = (np.cos(starts_rad) - np.cos(ends_rad)) / (ends_rad - starts_rad)
+    assert abs(lateral.sum() / modules) < 0.08
     assert abs(angles_deg(task_tables.bend(modules)).sum()) < 1e-9
 
 
 @pytest.mark.parametrize(("modules", "largest"), [(3, [3.6, 36.0, -39.6]), (2, [32.4, -32.4])])
 def test_down_is_the_triangle_of_s5(modules, largest):
     angles = features.bending_angle_deg(tasks.task("down", "pneumatic", modules))
-    for step, share in [(0, 0), (25, 0.5), (50, 1), (100, 0), (150, -1), (175, -0.5)]:
-        np.testing.assert_allclose(angles[step], share * np.array(largest), atol=1e-9)
+    for step, fraction in [(0, 0), (25, 0.5), (50, 1), (100, 0), (150, -1), (175, -0.5)]:
+        np.testing.assert_allclose(angles[step], fraction * np.array(largest), atol=1e-9)
     np.testing.assert_allclose(angles.sum(axis=1), 0, atol=1e-9)
 
 
-def test_unknown_task_names_the_known_ones():
-    with pytest.raises(UsageError, match="edge, down"):
+def test_unknown_task_is_refused_with_the_names():
+    with pytest.raises(UsageError, match=r"expected edge, down, or a \.npy file"):
         tasks.load_task("sideways", robot.load("pneumatic-3"))
 
 
-def test_task_from_a_file(tmp_path):
+def test_task_is_loaded_from_a_file(tmp_path):
     path = tmp_path / "task.npy"
     np.save(path, tasks.task("edge", "pneumatic", 2))
     loaded = tasks.load_task(str(path), robot.load("pneumatic-2"))
@@ -103,13 +103,13 @@ def test_task_from_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("content", [np.zeros((5, 2, 3)), np.ones((5, 2, 3), dtype=int), np.full((5, 2, 3), np.nan)])
-def test_task_file_of_no_unit_vectors_is_refused(tmp_path, content):
+def test_task_file_without_unit_vectors_is_refused(tmp_path, content):
     np.save(tmp_path / "task.npy", content)
     with pytest.raises(UsageError, match="unit vector"):
         tasks.load_task(str(tmp_path / "task.npy"), robot.load("pneumatic-2"))
 
 
-def test_task_file_missing_or_damaged(tmp_path):
+def test_missing_or_damaged_task_file_is_refused(tmp_path):
     with pytest.raises(UsageError, match="no task file"):
         tasks.load_task(str(tmp_path / "none.npy"), robot.load("pneumatic-2"))
     (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY broken")
@@ -126,7 +126,7 @@ def test_task_file_missing_or_damaged(tmp_path):
         tasks.load_task(str(tmp_path / "folder.npy"), robot.load("pneumatic-2"))
 
 
-def test_task_file_without_a_step_and_archives(tmp_path):
+def test_empty_task_file_and_archive_are_refused(tmp_path):
     np.save(tmp_path / "none.npy", np.zeros((0, 2, 3)))
     with pytest.raises(UsageError, match="found 0 steps, expected at least 1"):
         tasks.load_task(str(tmp_path / "none.npy"), robot.load("pneumatic-2"))
