@@ -16,6 +16,7 @@ from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.training.data import collect as c
 from modsoft.training.data import dataset
+from modsoft.training.simulation.parameters import NOMINAL
 from modsoft.training.simulation.simulators import Simulator
 
 STAND_IN = """
@@ -332,7 +333,7 @@ def test_the_robots_of_a_varied_data_set_differ_from_the_drawing_eight_episodes_
     module_kg = 1050 * np.pi * 0.01**2 * 0.05
     assert 0.1 < np.mean(payloads == 0.0) < 0.5
     assert 2.5 * module_kg < payloads.max() < 4 * module_kg
-    assert c.perturbation_of(c.recipe_of(robot, "smooth", 5, 30, "stand-in"), robot, 0) is None
+    assert c.perturbation_of(c.recipe_of(robot, "smooth", 5, 30, "stand-in"), robot, 0) == NOMINAL
 
 
 def test_an_episode_is_simulated_on_its_own_robot_whatever_is_asked_for_with_it():

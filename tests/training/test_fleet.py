@@ -11,7 +11,7 @@ from modsoft.runtime.errors import ModsoftError, UsageError
 from modsoft.training.simulation import fleet, fleet_kernel
 from modsoft.training.simulation.elastica import Arm
 from modsoft.training.simulation.fleet import Arms, Fleet
-from modsoft.training.simulation.parameters import PLANTS
+from modsoft.training.simulation.parameters import PLANTS, Perturbation
 from modsoft.training.simulation.rollout import rollout
 
 pytestmark = pytest.mark.instructions
@@ -83,10 +83,10 @@ def test_equals_pyelastica_for_other_module_numbers(kind, modules, periods):
     ],
 )
 def test_robots_off_the_drawing_equal_pyelastica_too(kind, modules, periods, stiffness, payload_modules):
-    changed = {"stiffness": stiffness, "tip_payload_kg": payload_modules * PLANTS[kind].module_kg}
+    changed = Perturbation(stiffness, payload_modules * PLANTS[kind].module_kg)
     drawn = actions(kind, periods, 1, modules, seed=modules)
-    robots = configurations(Fleet(kind, modules, 1, damping="explicit", **changed), drawn)[:, 0]
-    arm = configurations(Arms(kind, modules, 1, **changed), drawn)[:, 0]
+    robots = configurations(Fleet(kind, modules, 1, damping="explicit", perturbation=changed), drawn)[:, 0]
+    arm = configurations(Arms(kind, modules, 1, perturbation=changed), drawn)[:, 0]
     assert np.abs(robots - arm).max() < 1e-9
     assert np.abs(robots - configurations(Fleet(kind, modules, 1, damping="explicit"), drawn)[:, 0]).max() > 0.02
 
@@ -97,7 +97,7 @@ def test_a_softer_module_bends_further_and_the_others_much_as_before():
     drawn = np.broadcast_to([[0.3, 0.0]] * 3, (20, 1, 3, 2))
     stiff, soft = (
         configurations(Fleet("cable", 3, 1), drawn),
-        configurations(Fleet("cable", 3, 1, stiffness=[1.0, 0.8, 1.0]), drawn),
+        configurations(Fleet("cable", 3, 1, perturbation=Perturbation([1.0, 0.8, 1.0])), drawn),
     )
     angle = np.degrees(np.arccos([stiff[-1, 0, :, 2], soft[-1, 0, :, 2]]))
     assert 1.1 < angle[1, 1] / angle[0, 1] < 1.4
@@ -109,7 +109,7 @@ def test_a_softer_module_bends_further_and_the_others_much_as_before():
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_robots_off_the_drawing_stay_whole_under_full_range_jumps(modules, factor):
     drawn = np.random.default_rng(modules).choice([-1.0, 1.0], (3, 16, modules, 2))
-    robots = Fleet("cable", modules, 16, stiffness=[factor] * modules, tip_payload_kg=PLANTS["cable"].module_kg)
+    robots = Fleet("cable", modules, 16, perturbation=Perturbation([factor] * modules, PLANTS["cable"].module_kg))
     configurations(robots, drawn)
     assert robots.alive.all()
 
@@ -117,18 +117,18 @@ def test_robots_off_the_drawing_stay_whole_under_full_range_jumps(modules, facto
 @pytest.mark.parametrize(
     "changed",
     [
-        {"stiffness": [1.0, 1.0]},
-        {"stiffness": [1.0, 0.0, 1.0]},
-        {"stiffness": [1.0, np.nan, 1.0]},
-        {"tip_payload_kg": -0.01},
-        {"tip_payload_kg": np.nan},
+        Perturbation([1.0, 1.0]),
+        Perturbation([1.0, 0.0, 1.0]),
+        Perturbation([1.0, np.nan, 1.0]),
+        Perturbation(tip_payload_kg=-0.01),
+        Perturbation(tip_payload_kg=np.nan),
     ],
 )
 def test_stiffness_and_payload_of_no_robot_are_refused(changed):
     makers = [Arm] if fleet_kernel.library() is None else [Arm, lambda *given, **more: Fleet(*given, 1, **more)]
     for make in makers:
         with pytest.raises(ValueError, match=r"expected 3 positive numbers|expected 0 or more"):
-            make("cable", 3, **changed)
+            make("cable", 3, perturbation=changed)
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,7 @@ from modsoft.study.plan import Plan, Run
 from modsoft.study.scheduler import AddProgress, Stage
 from modsoft.training import made_from
 from modsoft.training.simulation.fleet import simulated
+from modsoft.training.simulation.parameters import Perturbation
 from modsoft.training.simulation.rollout import ControllerSetup, Rollout, rollout
 
 BATCH_SIZE = 16  # robots: two blocks of the kernel's widest vectors
@@ -116,7 +117,7 @@ def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], add_progress: A
         for run in batch
     ]
     properties = perturbations.robot_properties(first.perturbation, first.modules, first.model.seed)
-    simulator = simulated("cable", first.modules, len(batch), **properties)
+    simulator = simulated("cable", first.modules, len(batch), perturbation=Perturbation(**properties))
     sha256 = {model: stages.onnx_sha256(folder, model) for model in models}
     for run, setup, motion in zip(batch, setups, rollout(simulator, setups).robots(), strict=True):
         if not np.isfinite(motion.configuration).all():

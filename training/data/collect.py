@@ -30,8 +30,8 @@ from modsoft.training.data.backends import BACKENDS
 from modsoft.training.data.dataset import Episode
 from modsoft.training.data.episode_store import Shards, refuse_other
 from modsoft.training.simulation import simulators
-from modsoft.training.simulation.parameters import PLANTS
-from modsoft.training.simulation.simulators import Perturbation, Simulate, Simulator
+from modsoft.training.simulation.parameters import NOMINAL, PLANTS, Perturbation
+from modsoft.training.simulation.simulators import Simulate, Simulator
 
 ALIKE = 8  # episodes of a varied data set that have the same robot: the fleet's lanes
 STIFFNESS_OFF = 0.15  # of a module's stiffness, at most
@@ -40,11 +40,11 @@ VARIED = 1  # what tells these random numbers from an episode's own
 MOST_ATTEMPTS = 10  # a robot that is not finite so often in a row is broken, not unlucky
 
 
-def perturbation_of(recipe: dict[str, Any], robot: Robot, index: int) -> Perturbation | None:
+def perturbation_of(recipe: dict[str, Any], robot: Robot, index: int) -> Perturbation:
     """How the robot of an episode differs from the drawing: where the strategy is varied, every eight episodes have
     another robot, of which three in ten carry nothing. So the network learns to see in the history what it drives."""
     if recipe["strategy"] != "varied":
-        return None
+        return NOMINAL
     rng = np.random.default_rng(np.random.SeedSequence(recipe["seed"], spawn_key=(index // ALIKE, 0, VARIED)))
     stiffness = 1.0 + STIFFNESS_OFF * rng.uniform(-1.0, 1.0, robot.modules)
     payload_modules = rng.uniform(0.0, PAYLOAD_MODULES) if rng.uniform() < 0.7 else 0.0
@@ -53,12 +53,12 @@ def perturbation_of(recipe: dict[str, Any], robot: Robot, index: int) -> Perturb
 
 def episodes(recipe: dict[str, Any], robot: Robot, indices: list[int], simulate: Simulate) -> list[Episode]:
     """The episode of each index. One that is not finite is never kept: the robot is drawn again, and it is counted."""
-    of_variation: dict[Perturbation | None, list[int]] = {}
+    of_variation: dict[Perturbation, list[int]] = {}
     for index in indices:
         of_variation.setdefault(perturbation_of(recipe, robot, index), []).append(index)
     made: dict[int, Episode] = {}
     for perturbation, alike in of_variation.items():
-        drawn = simulate if perturbation is None else functools.partial(simulate, perturbation=perturbation)
+        drawn = simulate if perturbation == NOMINAL else functools.partial(simulate, perturbation=perturbation)
         made |= _alike(recipe, robot, alike, drawn)
     return [made[index] for index in indices]
 

@@ -6,8 +6,6 @@ from `loads.add_loads`, one compiled call a time step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import elastica
 import numpy as np
 
@@ -15,8 +13,8 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.actuation import activations
 from modsoft.runtime.control.features import from_directors
 from modsoft.runtime.errors import ModsoftError
-from modsoft.training.simulation.loads import add_loads, follow
-from modsoft.training.simulation.parameters import PASCAL_PER_BAR, PLANTS, PlantParameters
+from modsoft.training.simulation.loads import LoadConstants, Rod, add_loads, follow
+from modsoft.training.simulation.parameters import NOMINAL, PASCAL_PER_BAR, PLANTS, Perturbation, PlantParameters
 
 
 class _Simulator(elastica.BaseSystemCollection, elastica.Constraints, elastica.Forcing):
@@ -24,7 +22,7 @@ class _Simulator(elastica.BaseSystemCollection, elastica.Constraints, elastica.F
 
 
 class _Loads(elastica.NoForces):
-    """Hands the rod's arrays to `add_loads`, and the pressures to their lags, once a time step."""
+    """Applies `add_loads`, and the lags of the pressures, in every time step."""
 
     def __init__(self, plant: PlantParameters, state: dict[str, Array]) -> None:
         super().__init__()
@@ -33,7 +31,7 @@ class _Loads(elastica.NoForces):
         # Rounded because cos(90 degrees) is 6e-17, which would let a planar arm leave its plane.
         directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=-1), 15)
         scale = plant.radius_m * plant.module_length_m / plant.elements
-        self._constants = (
+        constants = LoadConstants(
             plant.gravity_m_s2,
             plant.damping_n_s_m2,
             plant.torque_damping_n_s,
@@ -44,53 +42,33 @@ class _Loads(elastica.NoForces):
             actuators.longest,
             np.array([plant.friction_n_m2, plant.friction_curvature_per_m]),
         )
+        self._constants = tuple(constants)
         self._state = state
         lags = np.array([actuators.valve_lag_s, actuators.chamber_lag_s])
-        self._shares = tuple(1.0 - np.exp(-plant.time_step_s / lags)) if lags.any() else None
+        self._gains = tuple(1.0 - np.exp(-plant.time_step_s / lags)) if lags.any() else None
 
     def apply_forces(self, system: elastica.CosseratRod, time: float = 0.0) -> None:
         state = self._state
-        if self._shares:
-            follow(state["set_pa"], state["valve_pa"], state["stress_pa"], *self._shares)
-        add_loads(
-            *self._constants,
-            state["stress_pa"],
-            state["slip"],
-            system.mass,
-            system.radius,
-            system.lengths,
-            system.rest_voronoi_lengths,
-            system.dilatation,
-            system.voronoi_dilatation,
-            system.tangents,
-            system.sigma,
-            system.kappa,
-            system.director_collection,
-            system.velocity_collection,
-            system.omega_collection,
-            system.external_forces,
-            system.external_torques,
-        )
+        if self._gains:
+            follow(state["set_pa"], state["valve_pa"], state["stress_pa"], *self._gains)
+        arrays = tuple(getattr(system, name) for name in Rod._fields)
+        add_loads(self._constants, arrays, state["stress_pa"], state["slip"])
 
 
 class Arm:
     """A robot of `modules` modules of one kind (`cable` or `pneumatic`), starting at rest at activation 0.
 
     kind: a key of `robots.PLANTS`. Activation 0 of a pneumatic arm is its lower pressure, not a vented chamber. A wrong
-    shape, an actuation outside [-1, 1] or pressures on a cable robot raise ValueError. stiffness, tip_payload_kg: as
-    in `fleet.Fleet`.
+    shape, an actuation outside [-1, 1] or pressures on a cable robot raise ValueError.
 
     A pneumatic arm is simulated as a rod in space too, loads and start in the x-z plane: its motion then stays in the
     plane by itself, exactly, because every force out of it is a sum of zeros.
     """
 
-    def __init__(
-        self, kind: str, modules: int, *, stiffness: Sequence[float] | Array | None = None, tip_payload_kg: float = 0.0
-    ) -> None:
+    def __init__(self, kind: str, modules: int, *, perturbation: Perturbation = NOMINAL) -> None:
         self.kind = kind
-        self.plant = PLANTS[kind].carrying(tip_payload_kg)
         self.modules = modules
-        self._stiffness = self.plant.stiffness_ratios(modules, stiffness)
+        self.plant, self._stiffness = PLANTS[kind].perturbed(modules, perturbation)
         self._time_s = np.float64(0.0)
         self._owed_s = 0.0
         self._build()

@@ -23,7 +23,7 @@ from modsoft.runtime.control.features import from_directors
 from modsoft.runtime.errors import ModsoftError
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.fleet_kernel import Damping
-from modsoft.training.simulation.parameters import PLANTS
+from modsoft.training.simulation.parameters import NOMINAL, PLANTS, Perturbation
 
 # What stands in memory for one element, in vectors: `struct element` and `struct drive` of fleet_kernel.h.
 _ELEMENT = 20
@@ -56,8 +56,7 @@ class Fleet:
 
     threads: work on that many blocks of robots (of `lanes` each) at a time; the numbers stay the same.
 
-    stiffness (N,): factors on each module's bending, twisting, shear and stretching stiffness, 1 by default.
-    tip_payload_kg: a point mass at the last node, with its weight. All robots of a fleet are alike.
+    perturbation: the same for all robots of the fleet.
     """
 
     def __init__(
@@ -70,8 +69,7 @@ class Fleet:
         time_step_s: float | None = None,
         threads: int = 1,
         variant: str | None = None,
-        stiffness: Sequence[float] | Array | None = None,
-        tip_payload_kg: float = 0.0,
+        perturbation: Perturbation = NOMINAL,
     ) -> None:
         library, runnable = fleet_kernel.library(), fleet_kernel.variants()
         if library is None:
@@ -83,7 +81,7 @@ class Fleet:
         self._library = library
         self.lanes: int = library.fleet_lanes(self._variant)
         self.kind, self.modules, self.count, self.damping = kind, modules, count, damping
-        self.plant = PLANTS[kind].carrying(tip_payload_kg)
+        self.plant, self._stiffness = PLANTS[kind].perturbed(modules, perturbation)
         self.time_step_s = self.plant.time_step_s if time_step_s is None else time_step_s
         self._alternate = fleet_kernel.alternate(self.plant)
         elements = modules * self.plant.elements
@@ -96,7 +94,6 @@ class Fleet:
         self._rest_length_m = self.plant.module_length_m / self.plant.elements
         self._places = 0.5 * self.plant.radius_m / self._rest_length_m * np.array(fleet_kernel.places(self.plant)[1])
         self._mobility = self.time_step_s**2 / self._rest_length_m / mass
-        self._stiffness = self.plant.stiffness_ratios(modules, stiffness)
         self._rigidity = self.plant.bend_ratios(self._stiffness)
         self._constants = self._with_arrays(damping)
         # Newtons of a pascal at weight 1.
@@ -229,19 +226,11 @@ class Arms:
 
     damping: Damping = "explicit"
 
-    def __init__(
-        self,
-        kind: str,
-        modules: int,
-        count: int,
-        *,
-        stiffness: Sequence[float] | Array | None = None,
-        tip_payload_kg: float = 0.0,
-    ) -> None:
+    def __init__(self, kind: str, modules: int, count: int, *, perturbation: Perturbation = NOMINAL) -> None:
         from modsoft.training.simulation.elastica import Arm  # takes seconds to import
 
         self.kind, self.modules, self.count = kind, modules, count
-        self._arms = [Arm(kind, modules, stiffness=stiffness, tip_payload_kg=tip_payload_kg) for _ in range(count)]
+        self._arms = [Arm(kind, modules, perturbation=perturbation) for _ in range(count)]
         self.alive = np.ones(count, dtype=bool)
 
     @property
@@ -271,17 +260,11 @@ class Arms:
 
 
 def simulated(
-    kind: str,
-    modules: int,
-    count: int,
-    damping: Damping = "exponential",
-    *,
-    stiffness: Sequence[float] | Array | None = None,
-    tip_payload_kg: float = 0.0,
+    kind: str, modules: int, count: int, damping: Damping = "exponential", *, perturbation: Perturbation = NOMINAL
 ) -> Fleet | Arms:
     """`count` robots at rest, on the fastest plant that this installation has. Where it has no kernel, PyElastica
     serves, and standard error is told in one line."""
     if fleet_kernel.library() is not None:
-        return Fleet(kind, modules, count, damping, stiffness=stiffness, tip_payload_kg=tip_payload_kg)
+        return Fleet(kind, modules, count, damping, perturbation=perturbation)
     print("the fast plant is not built (no C compiler at installation?): PyElastica simulates, slower", file=sys.stderr)
-    return Arms(kind, modules, count, stiffness=stiffness, tip_payload_kg=tip_payload_kg)
+    return Arms(kind, modules, count, perturbation=perturbation)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import fields
@@ -19,6 +20,16 @@ from modsoft.runtime.robot import Valve
 PASCAL_PER_BAR = 1e5
 # Chamber pressures at activation 0 and 1: what a robot file means that does not say otherwise.
 P_MIN_BAR, P_MAX_BAR = (each.default for each in fields(Valve) if each.name in ("p_min_bar", "p_max_bar"))
+
+
+class Perturbation(NamedTuple):
+    """How a robot differs from its kind's parameters."""
+
+    stiffness: Sequence[float] | None = None  # a factor for each module, on bending, twist, shear and stretch; None: 1
+    tip_payload_kg: float = 0.0  # a point mass at the last node, which has weight too
+
+
+NOMINAL = Perturbation()
 
 
 @dataclass(frozen=True)
@@ -75,27 +86,27 @@ class PlantParameters:
         """Mass of a module without its connector."""
         return self.density_kg_m3 * np.pi * self.radius_m**2 * self.module_length_m
 
-    def carrying(self, tip_payload_kg: float) -> PlantParameters:
-        """The same robot with a point mass at its last node, which has weight too."""
-        if not 0.0 <= tip_payload_kg < np.inf:
-            raise ValueError(f"found a payload of {tip_payload_kg} kg at the tip, expected 0 or more")
-        return dataclasses.replace(self, tip_mass_kg=self.tip_mass_kg + tip_payload_kg)
+    def perturbed(self, modules: int, perturbation: Perturbation) -> tuple[PlantParameters, Array]:
+        """The parameters with the payload, and the stiffness of the elements (modules * elements,) over the kind's own.
 
-    def stiffness_ratios(self, modules: int, factors: Sequence[float] | Array | None) -> Array:
-        """Stiffness of the elements (modules * elements,) over the kind's own: one factor a module (N,) on all of bend,
-        twist, shear and stretch; None for robots as they should be."""
-        found = np.ones(modules) if factors is None else np.asarray(factors, dtype=np.float64)
-        if found.shape != (modules,) or not ((found > 0.0) & (found < np.inf)).all():
+        Raises `ValueError` for factors that are not one positive number a module, and for a negative payload.
+        """
+        payload_kg, factors = perturbation.tip_payload_kg, perturbation.stiffness
+        if not 0.0 <= payload_kg < np.inf:
+            raise ValueError(f"found a payload of {payload_kg} kg at the tip, expected 0 or more")
+        ratios = np.ones(modules) if factors is None else np.asarray(factors, dtype=np.float64)
+        if ratios.shape != (modules,) or not ((ratios > 0.0) & (ratios < np.inf)).all():
             raise ValueError(f"found stiffness factors {factors}, expected {modules} positive numbers, base first")
-        return np.repeat(found, self.elements)
+        parameters = dataclasses.replace(self, tip_mass_kg=self.tip_mass_kg + payload_kg)
+        return parameters, np.repeat(ratios, self.elements)
 
     def bend_ratios(self, stiffness: Array) -> Array:
         """Rigidity against bending and twist in the Voronoi domains (elements - 1,), over that of a free section.
 
-        stiffness: `stiffness_ratios` of the elements. The wall of a module stiffens under the weight W that hangs from
-        its end: 1 + (W / `stiffening_weight_n`) ^ `stiffening_power`, but `stiffest_ratio` at most; the mean of both
-        modules at their border. The weight at rest is taken, once and for all: were it the momentary tension, a law
-        without an energy would feed the vibrations along the axis until the arm flew apart.
+        stiffness: that of the elements, from `perturbed`. The wall of a module stiffens under the weight W below its
+        end: 1 + (W / `stiffening_weight_n`) ^ `stiffening_power`, limited to `stiffest_ratio`; between two modules the
+        mean of both. W is the weight at rest: with the momentary tension the law would have no energy, feed vibrations
+        along the axis, and make the arm diverge.
         """
         below = np.arange(len(stiffness) // self.elements)[::-1]
         hanging_n = self.gravity_m_s2 * (below * (self.module_kg + self.connector_mass_kg) + self.tip_mass_kg)

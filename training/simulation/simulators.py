@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -12,22 +12,15 @@ from modsoft.runtime.errors import RobotFileError, UsageError
 from modsoft.runtime.robot import Robot
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.fleet import Arms, Fleet
-from modsoft.training.simulation.parameters import PASCAL_PER_BAR, PLANTS
+from modsoft.training.simulation.parameters import NOMINAL, PASCAL_PER_BAR, PLANTS, Perturbation
 from modsoft.training.simulation.rollout import rollout
-
-
-class Perturbation(NamedTuple):
-    """How a robot differs from the drawing."""
-
-    stiffness: tuple[float, ...]  # factor of each module
-    tip_payload_kg: float
 
 
 class Simulate(Protocol):
     """Robot and actions (B, K, N, A) of episodes from rest -> configurations (B, K + 1, N, 3), not finite where a robot
     was lost; what one episode gives does not depend on the others beside it."""
 
-    def __call__(self, robot: Robot, actions: Array, *, perturbation: Perturbation | None = None) -> Array: ...
+    def __call__(self, robot: Robot, actions: Array, *, perturbation: Perturbation = NOMINAL) -> Array: ...
 
 
 class Simulator(NamedTuple):
@@ -61,21 +54,17 @@ def by_name(name: str, robot: Robot) -> Simulator:
 
 
 def by_fleet(
-    robot: Robot, actions: Array, variant: str | None = None, *, perturbation: Perturbation | None = None
+    robot: Robot, actions: Array, variant: str | None = None, *, perturbation: Perturbation = NOMINAL
 ) -> Array:
     """Robots side by side in compiled code."""
-    fleet = Fleet(robot.kind, robot.modules, len(actions), variant=variant, **_overrides(perturbation))
+    fleet = Fleet(robot.kind, robot.modules, len(actions), variant=variant, perturbation=perturbation)
     return _run(fleet, actions, robot.loop.period_s)
 
 
-def by_elastica(robot: Robot, actions: Array, *, perturbation: Perturbation | None = None) -> Array:
+def by_elastica(robot: Robot, actions: Array, *, perturbation: Perturbation = NOMINAL) -> Array:
     """One robot after the other in PyElastica, the reference."""
-    arms = Arms(robot.kind, robot.modules, len(actions), **_overrides(perturbation))
+    arms = Arms(robot.kind, robot.modules, len(actions), perturbation=perturbation)
     return _run(arms, actions, robot.loop.period_s)
-
-
-def _overrides(perturbation: Perturbation | None) -> dict[str, Any]:
-    return {} if perturbation is None else perturbation._asdict()
 
 
 def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:
