@@ -30,7 +30,7 @@ def _run_tests() -> None:
     subprocess.run(["make", "-s", "-C", str(ROOT / "firmware"), "native", f"OUT={out}", instrument], check=True)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     # The loops of `corrupt` assert no more than the tests, and would cover lines that no test checks.
-    command += ["-k", "not damaged_and_repeated", *(str(ROOT / "tests" / "firmware" / name) for name in TESTS)]
+    command += ["-k", "not corrupted_and_repeated", *(str(ROOT / "tests" / "firmware" / name) for name in TESTS)]
     tests = subprocess.run(command, cwd=ROOT, env={**os.environ, "MODSOFT_NATIVE_FIRMWARE": str(BUILD)}, check=False)
     if tests.returncode != 0:
         sys.exit("coverage: the tests fail; correct that first, see make test")

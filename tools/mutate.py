@@ -219,7 +219,7 @@ def _try_all(folder: Path, chosen: list[Mutant], listed: dict[str, str]) -> Muta
     mutation = Mutation(folder, chosen, listed)
     options = ["-q", "-s", "--disable-warnings", "--tb=native"]  # the shortest output, which is discarded
     options += [word for plugin in ("cacheprovider", "timeout", "faulthandler") for word in ("-p", f"no:{plugin}")]
-    options += ["-k", "not damaged_and_repeated and not arbitrary"]  # slow, and they detect no more than the others
+    options += ["-k", "not corrupted_and_repeated and not arbitrary"]  # slow, and they detect no more than the others
     code = pytest.main([*options, *(str(ROOT / "tests" / "firmware" / name) for name in TESTS)], plugins=[mutation])
     if code != 0:
         sys.exit(f"mutate: pytest failed with exit code {code}")

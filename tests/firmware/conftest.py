@@ -1,4 +1,4 @@
-"""The firmware's own source, compiled for this machine with the sanitiser, driven from the tests on virtual time."""
+"""The firmware's source, compiled for this machine with a sanitiser, on virtual time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BUILT = "MODSOFT_NATIVE_FIRMWARE"
 
 
 class NativeBoard:
-    """A board whose clock only moves when it is told to. Times in ms, pressures in 10 Pa."""
+    """A board whose clock advances only in `wait`. Times in ms, pressures in 10 Pa."""
 
     def __init__(self, library: ctypes.CDLL, boot_id: int = 0xB0A4D, start_ms: int = 5) -> None:
         self.library = library
@@ -55,25 +55,25 @@ class NativeBoard:
             self.update()
 
     def messages(self) -> list[protocol.WireFrame]:
-        """What the board has sent since the last look."""
+        """Return the frames that the board sent since the last call."""
         frames = self.parser.feed(self.drain())
         assert self.parser.errors == 0
         assert all(isinstance(frame, protocol.WireFrame) for frame in frames)
         return frames  # type: ignore[return-value]
 
-    # ---- what a host does
+    # ---- actions of a host
 
-    def tell(self, message: protocol.Message, seq: int = 0, session: int | None = None) -> list[protocol.Message]:
-        """Send one message, return what the board answers at once."""
+    def send(self, message: protocol.Message, seq: int = 0, session: int | None = None) -> list[protocol.Message]:
+        """Send one message, return the immediate answers of the board."""
         self.messages()
         self.feed(protocol.encode(message, seq, self.session if session is None else session))
         return [frame.message for frame in self.messages()]
 
-    def beat(self, milliseconds: int, ticking: bool = True) -> None:
-        """Heartbeats at 10 Hz for a while."""
+    def heartbeats(self, milliseconds: int, ticking: bool = True) -> None:
+        """Send heartbeats at 10 Hz for this time."""
         for _ in range(milliseconds // 100):
             self.tick = (self.tick + ticking) & 0xFFFFFFFF
-            self.tell(protocol.Heartbeat(self.tick))
+            self.send(protocol.Heartbeat(self.tick))
             self.wait(100)
 
     def arm(self, channels: int = 0x3F, **changes: int) -> list[protocol.Message]:
@@ -84,34 +84,34 @@ class NativeBoard:
             "channels": channels,
             "p_full": 30000,
         } | changes
-        answers = self.tell(protocol.Arm(**fields), self.seq)
+        answers = self.send(protocol.Arm(**fields), self.seq)
         if self.state == protocol.State.ARMED:
             self.session = fields["new_session"]
         return answers
 
     def set(self, *pressures: int, **changes: int) -> list[protocol.Message]:
-        """Set-points of the first channels, the others 0; the sequence number goes on."""
+        """Send set-points of the first channels, 0 for the others, with the next sequence number."""
         self.tick = changes.get("tick", (self.tick + 1) & 0xFFFFFFFF)
         self.seq = changes.get("seq", (self.seq + 1) & 0xFF)
         padded = tuple(pressures) + (0,) * (protocol.CHANNELS - len(pressures))
-        return self.tell(protocol.Set(self.tick, padded), self.seq, changes.get("session"))
+        return self.send(protocol.Set(self.tick, padded), self.seq, changes.get("session"))
 
     def start(self, *pressures: int) -> None:
-        """From boot to RUNNING at these pressures, the sensors following."""
-        self.beat(1100)
+        """Bring the board from boot to RUNNING at these pressures; the sensors follow."""
+        self.heartbeats(1100)
         self.arm()
         assert self.state == protocol.State.ARMED
         self.set(*pressures)
         assert self.state == protocol.State.RUNNING
         for _ in range(5):
-            self.beat(100)
+            self.heartbeats(100)
             self.follow()
 
     def follow(self) -> None:
-        """Sensors read what is applied."""
+        """Let the sensors read the applied pressures."""
         self.measured[:6] = self.applied[:6]
 
-    # ---- looks inside
+    # ---- state of the board
 
     @property
     def state(self) -> protocol.State:
@@ -132,11 +132,11 @@ class NativeBoard:
 
 @pytest.fixture(scope="session")
 def native() -> Path:
-    """The folder with the firmware compiled for this machine: built now, or by whoever set the variable."""
+    """The folder with the firmware compiled for this machine: built now, or given by the environment variable."""
     if folder := os.environ.get(BUILT):
         return Path(folder)
     if shutil.which("gcc") is None or shutil.which("make") is None:
-        pytest.skip("no gcc or make here to compile the firmware natively")
+        pytest.skip("needs gcc and make")
     done = subprocess.run(["make", "-C", str(ROOT / "firmware"), "native"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return ROOT / "build" / "firmware"
@@ -144,7 +144,7 @@ def native() -> Path:
 
 @pytest.fixture(scope="session")
 def sanitised(native: Path) -> ctypes.CDLL:
-    """The firmware with the undefined-behaviour sanitiser, which ends the test run at the first finding."""
+    """The firmware with the sanitiser of undefined behaviour, which ends the test run at the first finding."""
     library = ctypes.CDLL(str(native / "libsupervisor.so"))
     library.board_new.restype = ctypes.c_void_p
     for function in (library.board_faults, library.supervisor_counts, library.board_rx_bad):

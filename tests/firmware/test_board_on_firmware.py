@@ -1,4 +1,4 @@
-"""The host's `Board` and the firmware's own source back to back, on one virtual clock."""
+"""The host's `Board` connected to the firmware's source, on one virtual clock."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from modsoft.runtime.board.protocol import Fault, State, VentMode
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, RobotFileError, Tripped
 
 BOOT_MS = 840  # the bootloader's window after a reset, as measured on the emulated MEGA
-BOOTLOADER_MS = 4800  # how long it stays once it has heard something
+BOOTLOADER_MS = 4800  # its duration after it received a byte
 
 
 class VirtualPort:
-    """A port with a native board behind it; reading lets time pass, a millisecond a step."""
+    """A port that is connected to a native board; a read advances time, one millisecond a step."""
 
     def __init__(self, make_board, reset_on_open=True, firmware=True):
         self.make_board = make_board
@@ -27,8 +27,8 @@ class VirtualPort:
         self.resets = 0
         self.pending = b""
         self.written = []  # (ms, bytes)
-        self.talked_to_bootloader = 0
-        self.deaf = self.mute = self.unplugged = self.follows = False
+        self.bytes_to_bootloader = 0
+        self.receives_nothing = self.sends_nothing = self.unplugged = False
         self.follows = True
         self._dtr = True
         self.is_open = True
@@ -50,14 +50,14 @@ class VirtualPort:
         if self.follows:
             self.board.follow()
         sent = self.board.drain()
-        self.pending += b"" if self.mute else sent
+        self.pending += b"" if self.sends_nothing else sent
 
     def run(self, milliseconds):
-        """Let the board live while the host does nothing."""
+        """Advance the board while the host does nothing."""
         for _ in range(milliseconds):
             self.step()
 
-    # ---- what pyserial offers
+    # ---- interface of pyserial
 
     @property
     def in_waiting(self):
@@ -77,9 +77,9 @@ class VirtualPort:
         self._check()
         self.written.append((self.now_ms, data))
         if self.now_ms < self.boots_at:
-            self.talked_to_bootloader += 1
+            self.bytes_to_bootloader += 1
             self.boots_at = self.now_ms + BOOTLOADER_MS
-        elif self.firmware and not self.deaf:
+        elif self.firmware and not self.receives_nothing:
             self.board.feed(data)
 
     def _check(self):
@@ -103,7 +103,7 @@ class VirtualPort:
         self.is_open = False
 
     def count(self, table):
-        """How often a message was sent, and when first."""
+        """Return how often a message was sent."""
         identifier = protocol.message_id(table)
         frames = [frame for _, data in self.written for frame in protocol.Parser().feed(data)]
         return sum(protocol.message_id(type(frame.message)) == identifier for frame in frames)
@@ -134,7 +134,7 @@ def changed(old, new):
 
 
 def run(board, port, seconds, pressures=HALF, first_tick=1, hz=2.5):
-    """A control loop that does its duty; returns the next tick."""
+    """Run a correct control loop; return the next tick."""
     for tick in range(first_tick, first_tick + round(seconds * hz)):
         board.set_pressures(tick, pressures)
         until = port.clock() + 1 / hz
@@ -143,7 +143,7 @@ def run(board, port, seconds, pressures=HALF, first_tick=1, hz=2.5):
     return first_tick + round(seconds * hz)
 
 
-def test_whole_run(rig):
+def test_complete_run(rig):
     board, port = rig
     assert port.board.state == State.IDLE
     board.arm(ROBOT)
@@ -170,7 +170,7 @@ def test_whole_run(rig):
 
 def test_nothing_is_sent_before_hello(port):
     board = connect(port)
-    assert (port.talked_to_bootloader, port.resets) == (0, 0)
+    assert (port.bytes_to_bootloader, port.resets) == (0, 0)
     run_pumps(board, 1)
     assert min(at for at, _ in port.written) >= BOOT_MS
 
@@ -180,7 +180,7 @@ def run_pumps(board, times):
         board._line.pump()
 
 
-def test_silent_port_is_reset_three_times_then_given_up(new_board):
+def test_silent_port_is_reset_three_times_before_the_error(new_board):
     port = VirtualPort(new_board, firmware=False)
     with pytest.raises(DeviceAbsent, match="not a byte came"):
         connect(port)
@@ -191,19 +191,19 @@ def test_silent_port_is_reset_three_times_then_given_up(new_board):
 
 
 def test_first_hello_lost_then_reset(port):
-    port.mute = True
+    port.sends_nothing = True
     original = port.reset
 
     def reset():
         original()
-        port.mute = False
+        port.sends_nothing = False
 
     port.reset = reset
     board = connect(port)
-    assert (port.resets, board.hello.boot_id, port.talked_to_bootloader) == (1, 2, 0)
+    assert (port.resets, board.hello.boot_id, port.bytes_to_bootloader) == (1, 2, 0)
 
 
-def test_board_that_does_not_reset_on_opening_is_asked(new_board):
+def test_board_that_does_not_reset_on_opening_gets_a_hello_request(new_board):
     port = VirtualPort(new_board, reset_on_open=False)
     port.run(10_000)
     port.pending = b""
@@ -214,7 +214,7 @@ def test_board_that_does_not_reset_on_opening_is_asked(new_board):
     board.arm(ROBOT)
 
 
-def test_fault_that_a_killed_host_left_behind_is_cleared_at_arming_only(new_board):
+def test_fault_of_a_killed_host_is_cleared_only_at_arming(new_board):
     port = VirtualPort(new_board, reset_on_open=False)
     first = connect(port)
     first.arm(ROBOT)
@@ -230,7 +230,7 @@ def test_fault_that_a_killed_host_left_behind_is_cleared_at_arming_only(new_boar
     assert port.board.state == State.RUNNING
 
 
-def test_fault_that_has_a_cause_is_not_cleared_at_arming(new_board):
+def test_fault_with_another_cause_is_not_cleared_at_arming(new_board):
     port = VirtualPort(new_board)
     board = connect(port)
     port.follows = False
@@ -251,7 +251,7 @@ def test_foreign_protocol_is_refused(new_board, monkeypatch):
     assert port.written == []
 
 
-def test_line_noise_instead_of_frames(new_board):
+def test_noise_instead_of_frames(new_board):
     port = VirtualPort(new_board, firmware=False)
     port.pending = bytes(range(256)) * 4
     with pytest.raises(DeviceAbsent, match="wrong baud rate"):
@@ -282,8 +282,8 @@ def test_cable_robot_has_nothing_to_arm(rig):
         rig[0].arm(robot.load("cable-4"))
 
 
-def test_lost_frames_are_survived(rig):
-    """Every request is repeated; a set-point is not, the next one wins."""
+def test_run_continues_after_lost_frames(rig):
+    """Every request is repeated; a set-point is not, because the next one replaces it."""
     board, port = rig
     original = port.write
     seen = []
@@ -302,7 +302,7 @@ def test_lost_frames_are_survived(rig):
     assert board.vent()
 
 
-def test_lost_answers_to_arm_are_survived(rig):
+def test_arming_succeeds_after_a_lost_answer(rig):
     board, port = rig
     original = port.step
     dropped = []
@@ -332,7 +332,7 @@ def test_host_killed(rig):
     assert port.board.faults == Fault.LINK_TIMEOUT
 
 
-def test_stopped_host_comes_back_to_a_latched_fault(rig):
+def test_stopped_host_finds_a_latched_fault_when_it_continues(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 2)
@@ -344,14 +344,14 @@ def test_stopped_host_comes_back_to_a_latched_fault(rig):
     assert not any(port.board.counts)
 
 
-def test_stuck_control_loop_is_noticed_by_the_board(rig):
+def test_board_detects_a_stopped_control_loop(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
-    stuck_at = port.now_ms
+    stopped_at = port.now_ms
     while any(port.board.counts):
-        board._line.pump()  # the I/O thread lives on
-    assert port.now_ms - stuck_at <= 1400
+        board._line.pump()  # the I/O thread still runs
+    assert port.now_ms - stopped_at <= 1400
     assert port.board.faults == Fault.CONTROL_TIMEOUT
     run_pumps(board, 40)
     with pytest.raises(Tripped, match="CONTROL_TIMEOUT"):
@@ -359,7 +359,7 @@ def test_stuck_control_loop_is_noticed_by_the_board(rig):
     assert board.vent()
 
 
-def test_loop_that_holds_keeps_the_board_running(rig):
+def test_board_keeps_running_while_the_loop_holds_its_set_points(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 1)
@@ -370,7 +370,7 @@ def test_loop_that_holds_keeps_the_board_running(rig):
     assert port.board.state == State.RUNNING
 
 
-def test_cable_pulled(rig):
+def test_unplugged_cable(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 2)
@@ -381,18 +381,18 @@ def test_cable_pulled(rig):
     assert board.vent() is False
 
 
-def test_deaf_board_vents_and_says_so(rig):
+def test_board_that_receives_no_frames_vents_and_reports_it(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
-    port.deaf = True
+    port.receives_nothing = True
     with pytest.raises(LostInRun):
         run(board, port, 4, first_tick=100)
-    assert board.vent()  # by its own timer, and it still said so
+    assert board.vent()  # by its own timer, and its status reports it
     assert port.board.faults == Fault.LINK_TIMEOUT
 
 
-def test_three_lost_set_points_are_a_loss_and_then_silence(rig):
+def test_after_three_lost_set_points_the_host_reports_the_loss_and_stops_sending(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 2)
@@ -406,29 +406,29 @@ def test_three_lost_set_points_are_a_loss_and_then_silence(rig):
     assert len(port.written) == silent_from
 
 
-def test_refused_set_points_are_a_loss(rig):
+def test_refused_set_points_are_reported_as_a_loss(rig):
     board, port = rig
     board.arm(changed("channel = 5", "channel = 6"))
     with pytest.raises(LostInRun, match=r"not acknowledged \(refused: range\)"):
-        run(board, port, 4)  # channel 5 belongs to nobody
+        run(board, port, 4)  # channel 5 is not armed
     assert board.vent()
 
 
-def test_mute_board_is_lost(rig):
+def test_board_that_sends_nothing_is_lost(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
-    port.mute = True
-    muted_at = port.now_ms
+    port.sends_nothing = True
+    silent_at = port.now_ms
     while board.lost is None:
         board._line.pump()
     assert "no word from the board" in board.lost
-    assert port.now_ms - muted_at <= 460
-    assert board.vent() is False  # it did vent, but it could not say so
+    assert port.now_ms - silent_at <= 460
+    assert board.vent() is False  # it vented, but could not report it
     assert not any(port.board.counts)
     listened_until = port.now_ms
     assert board.close() is False
-    assert port.now_ms == listened_until  # nobody waits twice
+    assert port.now_ms == listened_until  # it does not wait again
 
 
 def test_board_reset_in_mid_run(rig):
@@ -457,7 +457,7 @@ def test_a_set_point_that_waits_while_the_board_restarts_is_never_sent(rig):
     sets = port.count(protocol.Set)
     port.reset()
     port.boots_at = port.now_ms + 5
-    port.run(20)  # it has announced itself, and nobody has looked yet
+    port.run(20)  # it has sent HELLO, which the host has not read yet
     board.set_pressures(tick, HALF)
     run_pumps(board, 100)
     assert board.lost is not None
@@ -465,26 +465,26 @@ def test_a_set_point_that_waits_while_the_board_restarts_is_never_sent(rig):
     assert not any(port.board.counts)
 
 
-def test_vented_is_a_word_from_after_the_request(rig):
-    """One that was on its way already says nothing: the board may have been armed since."""
+def test_vented_is_a_status_from_after_the_request(rig):
+    """A status that was sent before the request proves nothing: the board may have been armed since."""
     board, port = rig
     port.run(110)
     assert port.pending
     assert board.vent()
-    asked_ms = max(
+    requested_ms = max(
         at
         for at, data in port.written
         for frame in protocol.Parser().feed(data)
         if isinstance(frame.message, protocol.Vent)
     )
-    assert port.now_ms - 1e3 * board.status_age_s > asked_ms
+    assert port.now_ms - 1e3 * board.status_age_s > requested_ms
 
 
-def test_a_valve_that_stays_open_is_seen_by_its_sensor(rig):
+def test_sensor_shows_a_valve_that_stays_open(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
-    port.follows = False  # the sensors go on showing 0.2 bar
+    port.follows = False  # the sensors keep showing 0.2 bar
     port.board.measured[1:6] = [0] * 5
     assert board.vent()
     began_ms = port.now_ms
@@ -492,7 +492,7 @@ def test_a_valve_that_stays_open_is_seen_by_its_sensor(rig):
     assert 950 <= port.now_ms - began_ms <= 1100
 
 
-def test_a_robot_that_empties_is_waited_for_no_longer_than_needed(rig):
+def test_host_waits_for_an_empty_robot_no_longer_than_needed(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
@@ -514,7 +514,7 @@ def test_residual_pressure_is_compared_with_the_limit_that_the_board_reports(rig
     assert board.residual_pressures_bar() == pytest.approx(residual_bar)
 
 
-def test_restart_between_two_looks_is_seen_by_the_boot_id(rig):
+def test_boot_id_shows_a_restart_between_two_reads(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 1)
@@ -525,7 +525,7 @@ def test_restart_between_two_looks_is_seen_by_the_boot_id(rig):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e308, -0.01, 0.3501])
-def test_no_wild_set_point_is_sent(rig, bad):
+def test_no_invalid_set_point_is_sent(rig, bad):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 1)
@@ -536,7 +536,7 @@ def test_no_wild_set_point_is_sent(rig, bad):
     assert port.count(protocol.Set) == sets
 
 
-def test_set_pressures_takes_a_row(rig):
+def test_set_pressures_takes_one_dimension(rig):
     board, _ = rig
     board.arm(ROBOT)
     with pytest.raises(ValueError, match="shape"):
@@ -545,7 +545,7 @@ def test_set_pressures_takes_a_row(rig):
         board.set_pressures(1, np.zeros(13))
 
 
-def test_newest_set_point_wins_and_none_is_sent_twice(rig):
+def test_only_the_newest_set_point_is_sent_and_only_once(rig):
     board, port = rig
     board.arm(ROBOT)
     board.set_pressures(1, np.full(6, 0.1))
@@ -574,22 +574,22 @@ def test_over_pressure_trips_the_host(rig):
 
 
 @pytest.mark.parametrize("mode", list(VentMode))
-def test_vent_is_said_only_after_the_board_said_it(rig, mode):
+def test_vent_succeeds_only_after_the_board_reports_it(rig, mode):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2, pressures=np.full(6, 0.35))
     started = port.now_ms
     assert board.vent(mode)
     assert not any(port.board.counts)
-    took = port.now_ms - started
-    assert (took <= 20) if mode is VentMode.DUMP else (175 <= took <= 300)
+    duration_ms = port.now_ms - started
+    assert (duration_ms <= 20) if mode is VentMode.DUMP else (175 <= duration_ms <= 300)
 
 
-def test_vent_gives_up_honestly_when_the_valves_stay_open(rig):
+def test_vent_reports_failure_when_the_valves_stay_open(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 1)
-    port.deaf = True
+    port.receives_nothing = True
     assert board.vent(timeout_s=0.2) is False
 
 

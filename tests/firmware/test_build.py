@@ -1,4 +1,4 @@
-"""The firmware as a whole: it builds for the MEGA, its logic has no hardware in it, wrong limits do not compile."""
+"""The build of the firmware: for the MEGA, without hardware in its logic, and not with wrong limits."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_builds_in_a_folder_of_any_name(tmp_path):
 
 
 @pytest.mark.parametrize("setting", ["OUT=/tmp/My Drive", "ARDUINO=/tmp/a:b"])
-def test_a_path_that_make_cannot_hold_is_one_line(setting):
+def test_a_path_that_make_does_not_accept_gives_one_line(setting):
     command = ["make", "-C", str(FIRMWARE), "--no-print-directory", setting]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
@@ -64,7 +64,7 @@ def test_logic_includes_no_hardware(name):
 )
 def test_impossible_limits_do_not_compile(tmp_path, changed, complaint):
     if shutil.which("gcc") is None:
-        pytest.skip("no gcc here")
+        pytest.skip("needs gcc")
     text = (FIRMWARE / "limits.h").read_text()
     assert changed[0] in text
     (tmp_path / "limits.h").write_text(text.replace(*changed))
@@ -80,19 +80,19 @@ def test_impossible_limits_do_not_compile(tmp_path, changed, complaint):
 
 
 def test_channels_have_the_pins_of_the_arduino_core():
-    """pins.h names port and bit; the core's own table of the MEGA must give the same for each pin number."""
+    """Port and bit of each pin in pins.h must be those of the Arduino core's table of the MEGA."""
     if not VARIANT.exists():
         pytest.skip("needs Debian package arduino-core-avr")
     rows = re.findall(r"X\((\d+), (\d+), (\d), ([ABC]), ([A-L]), (\d)\)", (FIRMWARE / "pins.h").read_text())
     assert [int(row[0]) for row in rows] == list(range(12))
-    assert int(rows[-1][1]) == 13, "the bootloader's lamp comes last"
+    assert int(rows[-1][1]) == 13, "the pin of the bootloader's LED is not the last"
     ports = {
         int(pin): (port, int(bit))
         for port, bit, pin in re.findall(r"// P([A-L]) (\d) \*\* (\d+) \*\*", VARIANT.read_text())
     }
     timers = dict(re.findall(r"TIMER(\d[ABC])\s*,\s*// P[A-L] \d \*\* (\d+) \*\*", VARIANT.read_text()))
     timer_of = {int(pin): timer for timer, pin in timers.items()}
-    assert timer_of[13] == "0A"  # the core uses pin 13's other timer; the chip has timer 1, unit C there as well
+    assert timer_of[13] == "0A"  # the core uses timer 0 for pin 13; the chip connects timer 1, unit C, as well
     timer_of[13] = "1C"
     for _, pin, timer, unit, port, bit in rows:
         assert ports[int(pin)] == (port, int(bit)), f"pin {pin}"

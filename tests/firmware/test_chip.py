@@ -31,7 +31,7 @@ class Sensors(ctypes.Structure):
 
 
 class Chip:
-    """A chip just powered on: a copy of the library has memory of its own."""
+    """A chip after power-on: each copy of the library has its own memory."""
 
     def __init__(self, library: Path) -> None:
         self.code = ctypes.CDLL(str(library))
@@ -64,22 +64,22 @@ def chip(native, tmp_path):
 
 @pytest.fixture
 def outputs():
-    """(timer, compare unit, port, bit) of each channel, as pins.h says."""
+    """(timer, compare unit, port, bit) of each channel, from pins.h."""
     rows = re.findall(r"X\(\d+, \d+, (\d), ([ABC]), ([A-L]), (\d)\)", (FIRMWARE / "pins.h").read_text())
     return [(TIMERS[int(timer)], "ABC".index(unit), PORTS[port], int(bit)) for timer, unit, port, bit in rows]
 
 
-def test_pins_are_low_before_they_become_outputs_and_nothing_is_connected(chip, outputs):
+def test_pins_are_low_before_they_become_outputs_and_no_timer_is_connected(chip, outputs):
     for port in PORTS.values():
         chip.registers[port] = 0xFF
-    for timer in TIMERS.values():  # as the Arduino core left them
+    for timer in TIMERS.values():  # other settings before
         chip.registers[timer : timer + 14] = [0xA5] * 14
     chip.code.pwm_begin()
     for timer in TIMERS.values():
-        assert chip.registers[timer] == 0b10  # nothing connected; mode 14, fast PWM up to ICRn, over both registers
+        assert chip.registers[timer] == 0b10  # no output connected; mode 14, fast PWM up to ICRn, in both registers
         assert chip.registers[timer + 1] == 0b11001  # no prescaler
         assert chip.word(timer + 6) == TOP
-        assert chip.word(timer + 4) == 0  # all begin together
+        assert chip.word(timer + 4) == 0  # all timers start together
     for channel, (_, _, port, bit) in enumerate(outputs):
         used = channel < 11
         assert chip.registers[port] >> bit & 1 == (not used)
@@ -100,7 +100,7 @@ def test_counts_reach_the_register_of_their_pin_and_no_other(chip, outputs, chan
     assert bytes(chip.registers) == before
 
 
-def test_the_bootloaders_pin_is_left_alone(chip):
+def test_the_pin_of_the_bootloader_is_not_used(chip):
     chip.code.pwm_begin()
     before = bytes(chip.registers)
     for channel in (11, 12, 255):
@@ -112,7 +112,7 @@ def test_the_bootloaders_pin_is_left_alone(chip):
 
 
 def convert(chip, sensors, reading):
-    """One conversion ends; returns what was being measured."""
+    """End one conversion; return its input."""
     source = chip.registers[ADMUX]
     chip.registers[ADCL], chip.registers[ADCL + 1] = reading & 0xFF, reading >> 8
     chip.registers[ADCSRA] &= ~CONVERTING
@@ -131,7 +131,7 @@ def begin(chip):
 REFERENCE = 0b01_0_11110  # the 1.1 V reference, against the supply
 
 
-def test_nothing_is_measured_before_its_first_reading(chip):
+def test_no_channel_is_measured_before_its_first_reading(chip):
     sensors = begin(chip)
     assert list(sensors.measured) == [NOT_MEASURED] * 12
     assert sensors.supply_mv == 0
@@ -140,7 +140,7 @@ def test_nothing_is_measured_before_its_first_reading(chip):
     assert chip.registers[ADCSRB] == 0  # inputs 0 to 7
 
 
-def test_a_conversion_is_never_waited_for(chip):
+def test_poll_does_not_wait_for_a_conversion(chip):
     sensors = begin(chip)
     before = bytes(sensors)
     assert not chip.code.sensors_poll(ctypes.byref(sensors))
@@ -158,10 +158,10 @@ def test_supply_first_then_64_rounds_of_all_sensors(chip):
 def test_supply_voltage(chip):
     sensors = begin(chip)
     convert(chip, sensors, 1)
-    assert sensors.supply_mv == 0  # the first one is not settled
+    assert sensors.supply_mv == 0  # the reference has not settled
     convert(chip, sensors, 225)
     assert sensors.supply_mv == 1100 * 1024 // 225
-    for reading, supply_mv in ((17, 0), (18, 62577), (0, 0)):  # 16 bits hold no more
+    for reading, supply_mv in ((17, 0), (18, 62577), (0, 0)):  # the largest value of 16 bits
         for _ in range(64 * 6 + 1):
             convert(chip, sensors, 225)
         convert(chip, sensors, reading)
@@ -177,7 +177,7 @@ def test_pressures(chip):
     assert list(sensors.measured) == [0, 10, 313, 5000, 9980, 9990] + [NOT_MEASURED] * 6  # 312.5: half is rounded up
 
 
-def test_without_sensors_the_supply_is_measured_all_the_time(native, tmp_path):
+def test_without_sensors_only_the_supply_is_measured(native, tmp_path):
     if not (native / "libsensorless.so").exists():
         pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
     chip = Chip(shutil.copy(native / "libsensorless.so", tmp_path))
@@ -191,10 +191,10 @@ def test_without_sensors_the_supply_is_measured_all_the_time(native, tmp_path):
 # ---- reset
 
 
-def test_power_on_makes_an_id_of_chance_and_every_reset_after_it_the_next(chip):
+def test_power_on_gives_a_random_id_and_every_reset_the_next_one(chip):
     first, cause = chip.boot()
     assert cause == ResetCause.POWER_ON
-    assert first == zlib.crc32(bytes(36))  # all of the memory that a reset leaves alone
+    assert first == zlib.crc32(bytes(36))  # all memory that a reset keeps
     assert [chip.boot() for _ in range(3)] == [(first + n, ResetCause.EXTERNAL) for n in (1, 2, 3)]
 
 
@@ -210,20 +210,20 @@ def test_power_on_makes_an_id_of_chance_and_every_reset_after_it_the_next(chip):
         (0b0011, ResetCause.POWER_ON),
     ],
 )
-def test_the_chips_own_flags_are_believed(chip, flags, cause):
+def test_the_flags_of_the_chip_give_the_cause(chip, flags, cause):
     chip.boot()
     assert chip.boot(flags)[1] == cause
-    assert chip.registers[MCUSR] == 0, "they would be there still after the next reset"
+    assert chip.registers[MCUSR] == 0, "the flags would remain after the next reset"
 
 
 @pytest.mark.parametrize(("hung_ms", "cause"), [(99, ResetCause.EXTERNAL), (100, ResetCause.WATCHDOG)])
-def test_behind_the_bootloader_a_starved_watchdog_is_told_by_the_clock(chip, hung_ms, cause):
+def test_behind_the_bootloader_the_clock_shows_a_watchdog_reset(chip, hung_ms, cause):
     chip.boot()
     chip.code.boot_feed_watchdog(5000)
     chip.millis.value = 5000 + hung_ms
     assert chip.boot()[1] == cause
     chip.millis.value = 0
-    assert chip.boot()[1] == ResetCause.EXTERNAL, "the last feeding of the run before is forgotten"
+    assert chip.boot()[1] == ResetCause.EXTERNAL, "the last feeding of the previous run counts"
 
 
 def test_watchdog_is_off_until_setup_and_fed_by_feeding(chip):

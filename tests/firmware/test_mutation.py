@@ -1,4 +1,4 @@
-"""A share of the mutation test (all of it: `make mutation`), and the tool's own work."""
+"""A part of the mutation test (all of it: `make mutation`), and the functions of the tool."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ def test_changes(mutate, code, expected):
 
 
 @pytest.mark.parametrize(
-    ("code", "left_out"),
+    ("code", "removed"),
     [("  c->tick = 1;", True), ("  send(c);", True), ("  break;", True), ("  int16_t a = 1;", False), ("  }", False)],
 )
-def test_statements_are_left_out_and_declarations_are_not(mutate, code, left_out):
-    assert bool(mutate.STATEMENT.fullmatch(code)) == left_out
+def test_statements_are_removed_and_declarations_are_not(mutate, code, removed):
+    assert bool(mutate.STATEMENT.fullmatch(code)) == removed
 
 
-def test_one_mutant_in_sixty_is_noticed():
+def test_one_mutant_in_sixty_is_detected():
     if shutil.which("gcc") is None or shutil.which("make") is None:
-        pytest.skip("no gcc or make here to compile the firmware natively")
+        pytest.skip("needs gcc and make")
     done = subprocess.run([sys.executable, TOOL, "--every", "60"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 survive" in done.stdout

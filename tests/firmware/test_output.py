@@ -1,4 +1,4 @@
-"""The output stage alone: it clamps and slews whatever it is told, for it is the last to touch a valve."""
+"""The output stage: it clamps and slews any target, because no check follows it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class OutputStage(ctypes.Structure):
 
 
 def step(library, stage, target, elapsed_ms=1, times=1):
-    """Every channel towards one target; returns what channel 0 gets."""
+    """Move every channel towards one target; return the output of channel 0."""
     targets = (ctypes.c_int16 * 12)(*[target] * 12)
     for _ in range(times):
         library.output_step(ctypes.byref(stage), targets, elapsed_ms)
@@ -25,7 +25,7 @@ def step(library, stage, target, elapsed_ms=1, times=1):
 def test_clamp(sanitised, target, reached):
     stage = OutputStage()
     assert step(sanitised, stage, target, times=300) == reached
-    assert list(stage.applied) == [reached] * 11 + [0]  # channel 11 is the bootloader's lamp
+    assert list(stage.applied) == [reached] * 11 + [0]  # channel 11 is the bootloader's LED
 
 
 def test_slew_both_ways(sanitised):
@@ -35,7 +35,7 @@ def test_slew_both_ways(sanitised):
     assert [step(sanitised, stage, 3500, elapsed_ms=3) for _ in range(2)] == [60, 120]
 
 
-def test_stall_does_not_turn_into_a_leap(sanitised):
+def test_stall_causes_no_jump(sanitised):
     stage = OutputStage()
     assert step(sanitised, stage, 3500, elapsed_ms=19) == 380
     assert step(sanitised, stage, 3500, elapsed_ms=20) == 780
@@ -43,14 +43,14 @@ def test_stall_does_not_turn_into_a_leap(sanitised):
     assert step(sanitised, stage, 0, elapsed_ms=1000) == 780
 
 
-def test_dump_is_at_once(sanitised):
+def test_dump_is_immediate(sanitised):
     stage = OutputStage()
     step(sanitised, stage, 1)
     sanitised.output_dump(ctypes.byref(stage))
     assert list(stage.applied) == [0] * 12
 
 
-def test_vented_is_every_channel_at_zero(sanitised):
+def test_vented_means_every_channel_at_zero(sanitised):
     sanitised.output_is_vented.restype = ctypes.c_bool
     assert sanitised.output_is_vented(ctypes.byref(OutputStage()))
     for channel in range(12):
@@ -59,7 +59,7 @@ def test_vented_is_every_channel_at_zero(sanitised):
         assert not sanitised.output_is_vented(ctypes.byref(stage))
 
 
-def test_no_counts_only_at_zero_and_full_counts_at_full_scale(sanitised):
+def test_counts_from_zero_to_full_scale(sanitised):
     stage = OutputStage()
     sanitised.output_counts.restype = ctypes.c_uint16
     counts = []
@@ -69,8 +69,8 @@ def test_no_counts_only_at_zero_and_full_counts_at_full_scale(sanitised):
     assert counts == [0, 0, 1, 137, 478, 4096]
 
 
-def test_slew_that_is_no_whole_step_a_millisecond(native):
-    """The rest of a step is kept, so that the rate comes out right over time."""
+def test_slew_with_a_fractional_step(native):
+    """The remainder of a step is kept, so that the mean rate is exact."""
     library = ctypes.CDLL(str(native / "libslew.so"))
     stage = OutputStage()
     reached = [step(library, stage, 3500) for _ in range(200)]

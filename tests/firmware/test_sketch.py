@@ -1,4 +1,4 @@
-"""The firmware's folder as the Arduino IDE 1.8.19 of Debian 12 compiles it: through arduino-builder, unmodified."""
+"""The unmodified firmware folder compiled by arduino-builder, as the Arduino IDE 1.8.19 of Debian 12 does."""
 
 import re
 import shutil
@@ -16,7 +16,7 @@ DEFINE = "-DDECIMAL_DIG=__DECIMAL_DIG__"
 
 @pytest.fixture
 def ide(tmp_path):
-    """Copies of the IDE's core and of the folder, in which nothing was compiled yet."""
+    """Copies of the IDE's core and of the folder, without compiled files."""
     if shutil.which("arduino-builder") is None or not CORE.is_dir() or shutil.which("avr-gcc") is None:
         pytest.skip("no Arduino IDE: apt-get install arduino-builder arduino-core-avr gcc-avr")
     shutil.copytree(FIRMWARE, tmp_path / "firmware")
@@ -28,8 +28,8 @@ def ide(tmp_path):
     return tmp_path
 
 
-def built(ide):
-    """The exit code and the output of the compilation of the folder."""
+def compile_sketch(ide):
+    """Compile the folder; return exit code and output."""
     command = ["arduino-builder", "-compile", "-hardware", ide / "hardware", "-hardware", BUILDER, "-tools", BUILDER]
     command += [
         "-fqbn",
@@ -46,7 +46,7 @@ def built(ide):
 
 def test_sketch_compiles_in_the_arduino_ide(ide):
     (ide / "hardware/arduino/avr/platform.local.txt").write_text(f"compiler.cpp.extra_flags={DEFINE}\n")
-    code, output = built(ide)
+    code, output = compile_sketch(ide)
     assert code == 0, output
     flash, ram = (int(re.search(pattern, output)[1]) for pattern in (r"uses (\d+) bytes", r"variables use (\d+) bytes"))
     assert 4000 < flash < 16_000

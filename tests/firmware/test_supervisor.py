@@ -14,14 +14,14 @@ FULL = (3500,) * 6
 
 
 def reason(answers):
-    """Why a frame was refused; there must be no other answer."""
+    """Return the reason of a refusal, which must be the only answer."""
     (nack,) = answers
     assert isinstance(nack, protocol.Nack)
     return NackReason(nack.reason)
 
 
 def until_vented(board, limit_ms=2000):
-    """Milliseconds until every output is 0, with nothing said by the host."""
+    """Return the milliseconds until every output is 0, without bytes from the host."""
     for elapsed in range(limit_ms):
         if not any(board.applied):
             return elapsed
@@ -29,7 +29,7 @@ def until_vented(board, limit_ms=2000):
     raise AssertionError(f"not vented after {limit_ms} ms: {board.applied}")
 
 
-def test_hello_comes_unasked_once_and_first(board):
+def test_hello_is_sent_once_at_boot_before_all_else(board):
     first, *rest = [frame.message for frame in board.messages()]
     assert isinstance(first, Hello)
     assert rest == []
@@ -49,12 +49,12 @@ def test_hello_comes_unasked_once_and_first(board):
     assert len(answers) == 10
 
 
-def test_before_the_first_pass_nothing_is_measured(board):
-    (status,) = board.tell(Vent(VentMode.RAMP))
+def test_before_the_first_pass_no_channel_is_measured(board):
+    (status,) = board.send(Vent(VentMode.RAMP))
     assert (status.state, status.measured) == (State.BOOT, (protocol.NOT_MEASURED,) * 12)
 
 
-def test_status_comes_every_tenth_of_a_second(board):
+def test_status_is_sent_every_100_ms(board):
     for _ in range(3):
         board.messages()
         board.wait(99)
@@ -66,17 +66,17 @@ def test_status_comes_every_tenth_of_a_second(board):
 
 
 def test_hello_on_request_in_any_state(running):
-    assert any(isinstance(answer, Hello) for answer in running.tell(HelloReq(protocol.PROTOCOL_HASH)))
+    assert any(isinstance(answer, Hello) for answer in running.send(HelloReq(protocol.PROTOCOL_HASH)))
     assert running.state == State.RUNNING
 
 
 def test_foreign_hello_request_is_answered_and_refused(board):
-    answers = board.tell(HelloReq(protocol.PROTOCOL_HASH ^ 1))
+    answers = board.send(HelloReq(protocol.PROTOCOL_HASH ^ 1))
     assert isinstance(answers[0], Hello)
     assert reason(answers[1:]) == NackReason.HASH
 
 
-def test_status_tells_it_all(running):
+def test_status_reports_the_state_of_the_board(running):
     running.wait(100)
     status = [frame.message for frame in running.messages()][-1]
     assert status.state == State.RUNNING
@@ -90,7 +90,7 @@ def test_status_tells_it_all(running):
     assert (status.rx_bad, status.rx_refused) == (0, 0)
 
 
-def test_status_counts_what_arrived(running):
+def test_status_counts_received_frames(running):
     def counted():
         running.messages()
         running.wait(100)
@@ -99,9 +99,9 @@ def test_status_counts_what_arrived(running):
 
     before = counted()
     for _ in range(3):
-        running.tell(protocol.Heartbeat(running.tick))
-    running.tell(ClearFault(0))  # nothing to clear: refused
-    running.feed(b"\x05\x05\0" + b"\0")  # the second delimiter ends nothing
+        running.send(protocol.Heartbeat(running.tick))
+    running.send(ClearFault(0))  # nothing to clear: refused
+    running.feed(b"\x05\x05\0" + b"\0")  # the second delimiter ends no frame
     assert [after - earlier for after, earlier in zip(counted(), before, strict=True)] == [4, 1, 1]
 
 
@@ -122,7 +122,7 @@ def test_every_pass_reports_every_check(running):
 
 
 def test_arm_needs_a_second_of_heartbeats(board):
-    board.beat(1000)
+    board.heartbeats(1000)
     board.now_ms -= 1
     assert reason(board.arm()) == NackReason.STATE
     board.now_ms += 1
@@ -131,8 +131,8 @@ def test_arm_needs_a_second_of_heartbeats(board):
     assert board.counts == [0] * 12
 
 
-def test_arm_needs_a_heartbeat_at_all(board):
-    """Also on a board whose clock has just begun, where "none yet" must not look like "at 0 ms"."""
+def test_arm_needs_at_least_one_heartbeat(board):
+    """Also shortly after the boot, where "no heartbeat yet" must differ from "a heartbeat at 0 ms"."""
     board.wait(1)
     assert reason(board.arm()) == NackReason.STATE
     board.wait(1500)
@@ -141,16 +141,16 @@ def test_arm_needs_a_heartbeat_at_all(board):
 
 @pytest.mark.parametrize(("gap_ms", "state"), [(300, State.ARMED), (301, State.IDLE)])
 def test_arm_needs_unbroken_heartbeats(board, gap_ms, state):
-    board.beat(900)  # ends 100 ms after the last one
+    board.heartbeats(900)  # ends 100 ms after the last heartbeat
     board.wait(gap_ms - 100)
-    board.beat(300)
+    board.heartbeats(300)
     board.arm()
     assert board.state == state
 
 
 @pytest.mark.parametrize(("gap_ms", "state"), [(300, State.ARMED), (301, State.IDLE)])
-def test_arm_needs_a_heartbeat_just_before(board, gap_ms, state):
-    board.beat(1500)
+def test_arm_needs_a_recent_heartbeat(board, gap_ms, state):
+    board.heartbeats(1500)
     board.wait(gap_ms - 100)
     board.arm()
     assert board.state == state
@@ -158,16 +158,16 @@ def test_arm_needs_a_heartbeat_just_before(board, gap_ms, state):
 
 def test_session_starts_at_the_sequence_number_of_its_arm(board):
     board.seq = 200
-    board.beat(1100)
+    board.heartbeats(1100)
     board.arm()
     (status,) = board.set(800)
     assert (status.acked_seq, status.state) == (201, State.RUNNING)
 
 
-def test_long_wait_before_the_first_set_point_is_no_stuck_loop(board):
-    board.beat(1100)
+def test_long_wait_before_the_first_set_point_is_no_control_timeout(board):
+    board.heartbeats(1100)
     board.arm()
-    board.beat(2000, ticking=False)
+    board.heartbeats(2000, ticking=False)
     board.set(800, tick=board.tick)
     board.wait(250)
     assert board.state == State.RUNNING
@@ -185,13 +185,13 @@ def test_long_wait_before_the_first_set_point_is_no_stuck_loop(board):
     ],
 )
 def test_arm_refused(board, changes, expected):
-    board.beat(1100)
+    board.heartbeats(1100)
     assert reason(board.arm(**changes)) == expected
     assert board.state == State.IDLE
 
 
-def test_arm_again_is_the_same_session(board):
-    board.beat(1100)
+def test_repeated_arm_keeps_the_session(board):
+    board.heartbeats(1100)
     board.arm()
     (again,) = board.arm(new_session=1)
     assert isinstance(again, Status)
@@ -200,34 +200,34 @@ def test_arm_again_is_the_same_session(board):
 
 @pytest.mark.parametrize(("session", "expected"), [(2, NackReason.STATE), (3, NackReason.SESSION)])
 def test_arm_for_another_session_while_armed_refused(board, session, expected):
-    board.beat(1100)
+    board.heartbeats(1100)
     board.arm()
     assert reason(board.arm(new_session=session)) == expected
     assert reason(board.set(800, session=session)) == NackReason.SESSION
 
 
-def test_arm_refused_while_running_and_old_arm_after(running):
+def test_arm_refused_while_running_and_old_arm_afterwards(running):
     assert reason(running.arm()) == NackReason.STATE
-    running.tell(Vent(VentMode.DUMP))
-    running.beat(1100)
+    running.send(Vent(VentMode.DUMP))
+    running.heartbeats(1100)
     assert reason(running.arm(new_session=1)) == NackReason.SESSION
     running.arm()
     assert running.state == State.ARMED
 
 
 def test_arm_refused_before_vented(running):
-    running.beat(1000)
-    running.tell(Vent(VentMode.RAMP))
+    running.heartbeats(1000)
+    running.send(Vent(VentMode.RAMP))
     assert any(running.applied)
     assert reason(running.arm()) == NackReason.STATE
 
 
-def test_sessions_go_round_and_skip_zero(board):
+def test_session_numbers_wrap_and_skip_zero(board):
     for session in [*range(1, 256), 1]:
-        board.beat(1000)
+        board.heartbeats(1000)
         board.arm(new_session=session)
         assert (board.state, board.session) == (State.ARMED, session)
-        board.tell(Vent(VentMode.DUMP))
+        board.send(Vent(VentMode.DUMP))
         board.messages()
 
 
@@ -235,7 +235,7 @@ def test_sessions_go_round_and_skip_zero(board):
 
 
 def test_slew_and_clamp(board):
-    board.beat(1100)
+    board.heartbeats(1100)
     board.arm()
     board.set(*FULL)
     worst = 0
@@ -251,9 +251,9 @@ def test_counts_are_the_pressure_over_full_scale(running):
     assert running.counts == [round(pressure * 4096 / 30000) for pressure in running.applied]
     for pressure in range(0, 3501, 7):
         running.set(pressure)
-        running.beat(100)
+        running.heartbeats(100)
         running.follow()
-        running.beat(200)
+        running.heartbeats(200)
         running.follow()
         assert abs(running.counts[0] - pressure * 4096 / 30000) <= 0.51
 
@@ -267,13 +267,13 @@ def test_out_of_range_rejects_the_whole_frame(running, pressures):
 
 
 def test_set_refused_outside_a_session(board):
-    board.beat(1100)
+    board.heartbeats(1100)
     assert reason(board.set(800)) == NackReason.STATE
 
 
 def test_set_and_heartbeat_of_another_session_refused(running):
     assert reason(running.set(800, session=2)) == NackReason.SESSION
-    assert reason(running.tell(protocol.Heartbeat(99), session=0)) == NackReason.SESSION
+    assert reason(running.send(protocol.Heartbeat(99), session=0)) == NackReason.SESSION
 
 
 def test_sequence_window(running):
@@ -287,7 +287,7 @@ def test_sequence_window(running):
 
 
 def test_first_set_must_follow_the_arm(board):
-    board.beat(1100)
+    board.heartbeats(1100)
     board.arm()
     assert reason(board.set(800, seq=0)) == NackReason.SEQUENCE
     assert board.state == State.ARMED
@@ -302,7 +302,7 @@ def test_older_tick_refused(running):
     assert running.library.board_set_point(running.handle, 0) == 1000
 
 
-def test_duplicate_is_acknowledged_not_applied_and_feeds_nothing(running):
+def test_duplicate_is_acknowledged_but_not_applied_and_feeds_no_timer(running):
     running.set(1000)
     (status,) = running.set(2000, seq=running.seq)
     assert status.acked_seq == running.seq
@@ -317,7 +317,7 @@ def test_duplicate_is_acknowledged_not_applied_and_feeds_nothing(running):
 def test_clock_and_tick_may_wrap(new_board, start_ms, ticks):
     board = new_board(start_ms=start_ms)
     board.tick = ticks
-    board.beat(1100)
+    board.heartbeats(1100)
     board.arm()
     for _ in range(30):
         board.set(800)
@@ -356,19 +356,19 @@ def with_crc(body):
 # ---- timers and faults
 
 
-def test_host_gone_vents_in_time(running):
-    running.beat(100)
+def test_lost_host_vents_in_time(running):
+    running.heartbeats(100)
     running.wait(200)  # 300 ms after the last heartbeat
     assert running.state == State.RUNNING
     running.wait(1)
     assert (running.state, running.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
-    assert running.applied[0] == 3480, "it ramps"
+    assert running.applied[0] == 3480, "no ramp"
     assert 301 + until_vented(running) <= 670
     assert running.counts == [0] * 12
 
 
-def test_armed_host_gone_is_a_fault_too(board):
-    board.beat(1100)
+def test_lost_host_while_armed_is_a_fault_too(board):
+    board.heartbeats(1100)
     (status,) = board.arm()
     assert status.state == State.ARMED
     board.wait(300)
@@ -377,7 +377,7 @@ def test_armed_host_gone_is_a_fault_too(board):
     assert (board.state, board.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
 
 
-def test_garbage_and_damaged_frames_do_not_feed_the_link(running):
+def test_garbage_and_corrupted_frames_do_not_feed_the_link_timer(running):
     good = protocol.encode(protocol.Heartbeat(1000), 0, running.session)
     for _ in range(310):
         running.feed(good[:5] + b"\x55" + good[6:] + b"\xaa\x00")
@@ -385,34 +385,34 @@ def test_garbage_and_damaged_frames_do_not_feed_the_link(running):
     assert running.faults == Fault.LINK_TIMEOUT
     running.wait(400)
     running.messages()
-    assert isinstance(running.tell(HelloReq(protocol.PROTOCOL_HASH))[0], Hello)
+    assert isinstance(running.send(HelloReq(protocol.PROTOCOL_HASH))[0], Hello)
 
 
-def test_heartbeats_of_an_old_session_are_no_sign_of_life(running):
+def test_heartbeats_of_an_old_session_do_not_feed_the_link_timer(running):
     for _ in range(31):
         running.tick += 1
-        running.tell(protocol.Heartbeat(running.tick), session=0)
+        running.send(protocol.Heartbeat(running.tick), session=0)
         running.wait(10)
     assert running.faults == Fault.LINK_TIMEOUT
 
 
-def test_stuck_control_loop_vents(running):
+def test_stopped_control_loop_vents(running):
     running.set(3500)
     started = running.now_ms
     for _ in range(11):
-        running.beat(100, ticking=False)
+        running.heartbeats(100, ticking=False)
         running.follow()
     assert running.faults == Fault.CONTROL_TIMEOUT
     assert running.now_ms - started + until_vented(running) <= 1400
 
 
 @pytest.mark.parametrize(("waited_ms", "state"), [(1000, State.RUNNING), (1001, State.FAULT)])
-def test_control_loop_may_stand_still_for_a_second(running, waited_ms, state):
+def test_control_loop_may_stop_for_one_second(running, waited_ms, state):
     running.set(800)
     for _ in range(waited_ms):
         running.wait(1)
         running.follow()
-        running.tell(protocol.Heartbeat(running.tick))
+        running.send(protocol.Heartbeat(running.tick))
     assert running.state == state
 
 
@@ -420,24 +420,24 @@ def test_latched_fault_needs_the_exact_mask_and_the_pressures_down(running):
     running.wait(301)
     assert running.faults == Fault.LINK_TIMEOUT
     assert reason(running.set(800)) == NackReason.STATE
-    assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # still ramping
+    assert reason(running.send(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # still ramping
     until_vented(running)
-    assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # sensors still up
+    assert reason(running.send(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE  # sensors still show pressure
     for channel in range(6):
         running.measured[:6] = [499] * 6
         running.measured[channel] = 500
         running.wait(1)
-        assert reason(running.tell(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE
+        assert reason(running.send(ClearFault(Fault.LINK_TIMEOUT))) == NackReason.STATE
     running.measured[:6] = [499] * 6
     running.wait(1)
     for mask in (0, Fault.LINK_TIMEOUT | Fault.LEAK, Fault.CONTROL_TIMEOUT):
-        assert reason(running.tell(ClearFault(mask))) == NackReason.RANGE
-    running.tell(ClearFault(Fault.LINK_TIMEOUT))
+        assert reason(running.send(ClearFault(mask))) == NackReason.RANGE
+    running.send(ClearFault(Fault.LINK_TIMEOUT))
     assert (running.state, running.faults) == (State.IDLE, Fault(0))
     assert reason(running.set(800)) == NackReason.STATE
 
 
-def test_faults_add_up_and_are_cleared_together(running):
+def test_faults_accumulate_and_are_cleared_together(running):
     running.wait(301)
     running.measured[:6] = [4501] * 6
     running.wait(100)
@@ -445,13 +445,13 @@ def test_faults_add_up_and_are_cleared_together(running):
     assert running.faults == both
     running.measured[:6] = [0] * 6
     running.wait(1)
-    assert reason(running.tell(ClearFault(Fault.OVER_PRESSURE))) == NackReason.RANGE
-    running.tell(ClearFault(both))
+    assert reason(running.send(ClearFault(Fault.OVER_PRESSURE))) == NackReason.RANGE
+    running.send(ClearFault(both))
     assert running.state == State.IDLE
 
 
 def test_clear_fault_without_fault_refused(running):
-    assert reason(running.tell(ClearFault(0))) == NackReason.STATE
+    assert reason(running.send(ClearFault(0))) == NackReason.STATE
 
 
 def test_over_pressure_dumps(running):
@@ -463,18 +463,18 @@ def test_over_pressure_dumps(running):
     assert running.counts == [0] * 12
 
 
-def test_short_over_pressure_is_none(running):
+def test_short_over_pressure_is_no_fault(running):
     for _ in range(5):
         running.measured[3] = 4501
         running.wait(99)
         running.measured[3] = 2000
         running.wait(1)
-        running.tell(protocol.Heartbeat(running.tick))
+        running.send(protocol.Heartbeat(running.tick))
     assert running.faults == Fault(0)
 
 
-def test_over_pressure_over_a_stall_of_any_length_dumps(board):
-    """The next pass comes late, after a minute and a bit that 16 bits of milliseconds would take for 50 ms."""
+def test_over_pressure_during_a_stall_of_any_length_dumps(board):
+    """The next pass comes after 65.6 s, which 16 bits of milliseconds would count as 50 ms."""
     board.wait(1)
     board.measured[0] = 9000
     board.now_ms += 0x10000 + 50
@@ -482,19 +482,19 @@ def test_over_pressure_over_a_stall_of_any_length_dumps(board):
     assert board.faults == Fault.OVER_PRESSURE
 
 
-def test_over_pressure_is_seen_while_idle_and_stays_latched(board):
+def test_over_pressure_is_detected_while_idle_and_stays_latched(board):
     board.measured[0] = 9000
     board.wait(200)
     assert board.faults == Fault.OVER_PRESSURE
-    assert reason(board.tell(ClearFault(Fault.OVER_PRESSURE))) == NackReason.STATE
+    assert reason(board.send(ClearFault(Fault.OVER_PRESSURE))) == NackReason.STATE
 
 
 @pytest.mark.parametrize(("reading", "fault"), [(1499, Fault.LEAK), (2501, Fault.SENSOR)])
-def test_sensor_that_does_not_follow(running, reading, fault):
+def test_sensor_that_does_not_follow_the_output(running, reading, fault):
     running.measured[3] = reading
-    running.beat(1900)
-    running.beat(99)
-    running.tell(protocol.Heartbeat(running.tick + 1))
+    running.heartbeats(1900)
+    running.heartbeats(99)
+    running.send(protocol.Heartbeat(running.tick + 1))
     running.wait(99)
     assert running.state == State.RUNNING
     running.wait(1)
@@ -502,9 +502,9 @@ def test_sensor_that_does_not_follow(running, reading, fault):
 
 
 @pytest.mark.parametrize("reading", [1500, 2500])
-def test_sensor_slightly_off_is_no_fault(running, reading):
+def test_small_sensor_difference_is_no_fault(running, reading):
     running.measured[3] = reading
-    running.beat(5000)
+    running.heartbeats(5000)
     assert (running.state, running.faults) == (State.RUNNING, Fault(0))
 
 
@@ -514,8 +514,8 @@ def test_pressure_at_the_limit_is_no_over_pressure(board):
     assert board.faults == Fault(0)
 
 
-def test_late_first_pass_does_not_count_the_time_before_it(new_board):
-    """The first reading of a board that took a while to start is not a tenth of a second of over-pressure."""
+def test_over_pressure_counts_from_the_first_pass(new_board):
+    """The time before the first reading does not count as over-pressure."""
     board = new_board(start_ms=50_000)
     board.measured[0] = 9000
     board.wait(99)
@@ -524,22 +524,22 @@ def test_late_first_pass_does_not_count_the_time_before_it(new_board):
     assert board.faults == Fault.OVER_PRESSURE
 
 
-def test_channels_without_a_sensor_are_not_judged_at_all(board):
-    board.beat(1100)
+def test_channels_without_a_sensor_cause_no_fault(board):
+    board.heartbeats(1100)
     board.arm(channels=0x7FF)
     board.set(*(800,) * 11)
     for _ in range(30):
-        board.beat(100)
+        board.heartbeats(100)
         board.follow()
     assert board.state == State.RUNNING
 
 
-def test_channels_of_no_session_are_not_judged_for_leaks(board):
-    board.beat(1100)
+def test_channels_outside_the_session_cause_no_leak(board):
+    board.heartbeats(1100)
     board.arm(channels=0x03)
     board.set(800, 800)
     board.measured[:6] = [800, 800, 4000, 4000, 4000, 4000]
-    board.beat(5000)
+    board.heartbeats(5000)
     assert board.state == State.RUNNING
 
 
@@ -548,34 +548,34 @@ def test_channels_of_no_session_are_not_judged_for_leaks(board):
 
 @pytest.mark.parametrize("session", [0, 77])
 def test_vent_ramps_from_any_session(running, session):
-    (status,) = running.tell(Vent(VentMode.RAMP), session=session)
+    (status,) = running.send(Vent(VentMode.RAMP), session=session)
     assert status.state == State.IDLE
     assert status.applied[0] == 3500
     assert 160 <= until_vented(running) <= 180
 
 
 @pytest.mark.parametrize("mode", [VentMode.DUMP, 200])
-def test_dump_is_at_once(running, mode):
-    (status,) = running.tell(Vent(mode))
+def test_dump_is_immediate(running, mode):
+    (status,) = running.send(Vent(mode))
     assert status.applied == (0,) * 12
 
 
 def test_vent_in_fault_stays_in_fault(running):
     running.wait(301)
-    (status,) = running.tell(Vent(VentMode.DUMP))
+    (status,) = running.send(Vent(VentMode.DUMP))
     assert (status.state, status.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
     assert status.applied == (0,) * 12
 
 
-def test_nothing_that_a_host_says_while_idle_opens_a_valve(board):
-    board.beat(1100)
+def test_no_set_point_opens_a_valve_while_idle(board):
+    board.heartbeats(1100)
     for seq in range(256):
         board.set(*FULL, seq=seq, session=seq)
         board.wait(1)
         assert board.counts == [0] * 12
 
 
-def test_queue_for_the_host_fills_to_the_brim(board):
+def test_queue_for_the_host_holds_255_bytes(board):
     board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH)) * 3)
     board.feed(protocol.encode(Vent(VentMode.RAMP)))
     board.feed(b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0")
@@ -585,14 +585,14 @@ def test_queue_for_the_host_fills_to_the_brim(board):
     assert len(raw) == 255
 
 
-def test_queue_for_the_host_fills_no_further(board):
-    """A full ring would look like an empty one: 256 bytes must not be queued."""
+def test_queue_for_the_host_does_not_hold_256_bytes(board):
+    """A full ring buffer would look like an empty one: 256 bytes must not be queued."""
     board.feed(protocol.encode(Vent(VentMode.RAMP)) * 2)
     board.feed((b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0") * 4)
     raw = board.drain()
     kinds = [type(frame.message) for frame in protocol.Parser().feed(raw)]
     assert kinds == [Hello, Status, Status] + [protocol.Nack] * 3
-    assert len(raw) + len(raw) - raw.rindex(b"\0\0") - 1 == 256  # one more refusal would have met the brim exactly
+    assert len(raw) + len(raw) - raw.rindex(b"\0\0") - 1 == 256  # with the last refusal
 
 
 def test_board_never_waits_for_a_host_that_does_not_read(board):
@@ -605,40 +605,40 @@ def test_board_never_waits_for_a_host_that_does_not_read(board):
         board.follow()
     assert board.state == State.RUNNING
     board.parser = protocol.Parser()
-    assert board.messages()  # whole frames only, none cut in two
+    assert board.messages()  # complete frames only
 
 
-def test_clearing_a_fault_is_answered_at_once(running):
-    running.wait(400)  # nothing heard: the link's timer
+def test_clear_fault_is_answered_immediately(running):
+    running.wait(400)  # no frames: the link timer
     until_vented(running)
     running.measured[:6] = [0] * 6
     running.wait(1)
     running.messages()
-    (answer,) = running.tell(ClearFault(running.faults))
+    (answer,) = running.send(ClearFault(running.faults))
     assert isinstance(answer, Status)
     assert (answer.state, answer.faults) == (State.IDLE, 0)
 
 
 def test_every_frame_of_the_board_carries_the_session(board):
-    told = []
+    sessions = []
     for _ in range(3):
-        board.beat(1100)
+        board.heartbeats(1100)
         board.arm()
         board.messages()
         board.wait(100)
-        told += [frame.session for frame in board.messages()]
-        board.tell(Vent(VentMode.RAMP))
-    assert told == [1, 2, 3]
+        sessions += [frame.session for frame in board.messages()]
+        board.send(Vent(VentMode.RAMP))
+    assert sessions == [1, 2, 3]
 
 
 @pytest.mark.parametrize(("channel", "fault"), [(3, Fault.SENSOR), (2, Fault(0)), (4, Fault(0))])
 def test_only_a_channel_of_this_robot_can_disagree(board, channel, fault):
-    """Armed for channel 3 alone: what is measured on its neighbours is not this robot's."""
-    board.beat(1100)
+    """Armed for channel 3 only: the sensors of its neighbours belong to no chamber of the robot."""
+    board.heartbeats(1100)
     board.arm(channels=1 << 3)
     board.set(0, 0, 0, 1000)
     for _ in range(40):
-        board.beat(100)
+        board.heartbeats(100)
         board.follow()
         board.measured[channel] += 1500
     assert board.faults == fault

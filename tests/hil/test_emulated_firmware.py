@@ -105,7 +105,7 @@ def resets_without(folder: Path, name: str, line: str) -> list[str]:
         return [event["cause"] for event in board.trace if event["event"] == "reset"]
 
 
-def test_every_check_is_found_and_all_of_them_feed_the_watchdog(firmware_copy: Path) -> None:
+def test_every_check_is_found_and_together_they_feed_the_watchdog(firmware_copy: Path) -> None:
     assert len(CHECKS) == 7
     assert resets_without(firmware_copy, "supervisor.c", "no such line") == ["power-on"]
 
