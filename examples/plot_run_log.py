@@ -5,19 +5,18 @@ from pathlib import Path
 
 import numpy as np
 
-from modsoft.runtime import log
+from modsoft.runtime import log_reader
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.training import plotting
 
 
 def main() -> None:
-    run = log.read(Path(sys.argv[1]))
+    run = log_reader.read(Path(sys.argv[1]))
     picture = Path(sys.argv[2]) if len(sys.argv) > 2 else Path("angles.png")
-    ticks = [tick for tick in run.ticks if tick["configuration"] is not None]  # None: no valid frame in that step
-    step = [tick["tick"] for tick in ticks]
-    measured, desired = (
-        bending_angle_deg(np.array([tick[key] for tick in ticks])) for key in ("configuration", "desired")
-    )
+    ticks = [tick for tick in run.ticks if tick.configuration is not None]  # None: no valid frame in that step
+    step = [tick.tick for tick in ticks]
+    measured = bending_angle_deg(np.array([tick.configuration for tick in ticks]))
+    desired = bending_angle_deg(np.array([tick.desired for tick in ticks]))
 
     def draw():
         figure = plotting.figure(7.0, 4.0)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 SLICE_S = 0.05  # waiting is cut into slices so that a lost device is noticed between two ticks
 SPIN_S = 0.001
+LATE_MS = 20.0  # a step or an acknowledgement later than this is late: 5 % of the period at 2.5 Hz
 
 
 def spinning(wait: Callable[[float], object], now: Callable[[], float] = time.monotonic) -> Callable[[float], object]:

@@ -1,11 +1,11 @@
-"""The controller: one task, tick by tick, from the tracker's frame to the set-points of the valves."""
+"""The control loop: one task, step by step, from the tracker's frame to the set-points of the valves."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Protocol
 
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS, State, Status
@@ -15,6 +15,15 @@ from modsoft.runtime.control.controller import Controller, Policy
 from modsoft.runtime.control.correction import Correction, NoCorrection
 from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.errors import LostInRun
+from modsoft.runtime.log_record import (
+    Acknowledgement,
+    BoardRecord,
+    DoneRecord,
+    FrameRecord,
+    Record,
+    StartRecord,
+    TickRecord,
+)
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FaultCounter, FrameCheck, FrameValidator
 from modsoft.runtime.statistics import TickStatistics
@@ -24,7 +33,7 @@ from modsoft.runtime.warmup import WarmUp
 
 
 class Valves(Protocol):
-    """What is used of `modsoft.runtime.board.board.Board` between arming and venting."""
+    """The part of `modsoft.runtime.board.board.Board` that is used between arming and venting."""
 
     @property
     def status(self) -> Status | None: ...
@@ -45,153 +54,163 @@ class Valves(Protocol):
 
 @dataclass(frozen=True)
 class Loop:
-    """What a run consists of. `desired` (K, N, 3): configurations at the start of each step; step k asks the
-    model for row k + 1, and the error counts where the robot is at the start of step k. `correction`: a new one."""
+    """What a run consists of. `desired` (K, N, 3): configurations at the start of each step; in step k the model gets
+    row k + 1 as reference, and the error is that at the start of step k. `correction`: a new one for each run."""
 
     robot: Robot
     model: Policy
     desired: Array
-    slot: LatestFrame
-    judge: FrameValidator
+    frames: LatestFrame
+    validator: FrameValidator
     valves: Valves
     ticker: Ticker
     stop: Stop
-    log: Callable[[dict[str, Any]], None]
-    tally: TickStatistics
+    log: Callable[[Record], None]
+    statistics: TickStatistics
     correction: Correction = field(default_factory=NoCorrection)
     warm_up: WarmUp | None = None
 
     def run(self, rest: Array) -> None:
         """Runs the whole task from `rest` (N, 3), the configuration of the vented robot; the board is armed.
 
-        Returns one period after the last step. Whatever ends it earlier is raised; venting is the caller's.
+        Returns one period after the last step. Whatever ends the task earlier is raised; the caller vents.
         """
-        robot, guard = self.robot, FaultCounter(self.robot)
-        controller = Controller(robot, self.model, rest, self.correction)
-        # The history begins with actuation 0, so the robot is given it for one period before the first step.
-        bar = channel_pressures_bar(robot, controller.applied, CHANNELS)
-        self._idle()  # arming takes a second: who asked to stop in it must not see a valve open first
-        began_ns = _ns(self.ticker.now())  # before it: no valve may be open earlier
-        sequence: int | None = self.valves.set_pressures(0, bar)
-        self.ticker.sent()
-        self.ticker.start(robot.loop.period_s)
-        self.log({"event": "start", "mono_ns": began_ns, "commanded_bar": bar})
-        targets, step = next_reference(self.desired), -1
-        warm_up = self.warm_up
+        controller, faults = Controller(self.robot, self.model, rest, self.correction), FaultCounter(self.robot)
+        references, step, sequence = next_reference(self.desired), -1, self._start(controller)
 
         def prepare(left_s: float) -> float:
-            if warm_up is None:
+            if self.warm_up is None:
                 return left_s
-            return warm_up.before(left_s, self.slot.latest(), controller.window, controller.applied)
+            return self.warm_up.before(left_s, self.frames.latest(), controller.window, controller.applied)
 
         while True:
             tick = self.ticker.next(self._idle, prepare)
             acknowledged = self._acknowledged(step, sequence)
-            guard.missed(min(tick.index, len(self.desired)) - step - 1)
-            for _ in range(tick.missed):  # the valves held what they had
+            faults.missed(min(tick.index, len(self.desired)) - step - 1)
+            for _ in range(tick.missed):  # the valves held their pressures
                 controller.skip()
             if tick.index >= len(self.desired):
-                self.log({"event": "done", "mono_ns": _ns(tick.start_s), "acknowledged": acknowledged})
+                self.log(DoneRecord(_ns(tick.start_s), acknowledged))
                 return
             step = tick.index
-            frame = self.slot.latest()
-            judged = self.judge.judge(frame, self.ticker.now())
-            desired = self.desired[step]
-            # What the step begins with is read before the set-points change it, the line is made after they are sent.
-            wall, board, link = datetime.now(UTC), self._board(), self.valves.statistics
-            outcome: dict[str, Any] = {"sent": False, "actuation": controller.applied, "commanded_bar": None}
-            try:
-                guard.frame(judged)
-                actuation = controller.compute(judged.configuration, desired, targets[step])
-                bar = channel_pressures_bar(robot, actuation, CHANNELS)
-                if not self.ticker.too_late(step):
-                    sequence = self.valves.set_pressures(step + 1, bar)
-                    self.ticker.sent()
-                    outcome |= {"sent": True, "actuation": actuation, "commanded_bar": bar}
-                    guard.on_time()
-                else:
-                    sequence = None  # the acknowledgement of the step before is not this one's
-                    self.valves.publish_tick(step + 1)
-                    guard.missed(1)
-            finally:  # the step that ended a run is the one that everybody wants to see
-                outcome["step_ms"] = (self.ticker.now() - tick.start_s) * 1e3
-                line = {
-                    **_begun(tick, wall, frame, judged),
-                    "desired": desired,
-                    "board": board,
-                    "acknowledged": acknowledged,
-                    "link": link,
-                    "aim": controller.target,
-                    "raw": controller.raw,
-                    **outcome,
-                }
-                self.log(line)
-            controller.record(outcome["actuation"])
-            self.tally.add(line, tick, judged)
-            if warm_up is not None:
-                warm_up.step_took(outcome["step_ms"] * 1e-3)
+            sequence = self._step(tick, references[step], controller, faults, acknowledged)
+
+    def _start(self, controller: Controller) -> int | None:
+        """Sends actuation 0 for one period before step 0, since the history of the model begins with it. Returns the
+        sequence number of the set-points."""
+        bar = channel_pressures_bar(self.robot, controller.applied, CHANNELS)
+        self._idle()  # arming takes a second: after a stop request during it, no valve may open
+        before_ns = _ns(self.ticker.now())  # no valve may be open earlier
+        sequence = self.valves.set_pressures(0, bar)
+        self.ticker.sent()
+        self.ticker.start(self.robot.loop.period_s)
+        self.log(StartRecord(before_ns, bar))
+        return sequence
+
+    def _step(
+        self, tick: Tick, reference: Array, controller: Controller, faults: FaultCounter, acknowledged: Acknowledgement
+    ) -> int | None:
+        """One control step. Returns the sequence number of its set-points, None where it sent none: the acknowledgement
+        of the step before is then not taken for that of this one."""
+        frame, sequence = self.frames.latest(), None
+        check = self.validator.judge(frame, self.ticker.now())
+        record = self._begun(tick, frame, check, controller, acknowledged)
+        try:
+            faults.frame(check)
+            actuation = controller.compute(check.configuration, record.desired, reference)
+            bar = channel_pressures_bar(self.robot, actuation, CHANNELS)
+            if self.ticker.too_late(tick.index):
+                self.valves.publish_tick(tick.index + 1)
+                faults.missed(1)
+            else:
+                sequence = self.valves.set_pressures(tick.index + 1, bar)
+                self.ticker.sent()
+                record.sent, record.actuation, record.commanded_bar = True, actuation, bar
+                faults.on_time()
+        finally:  # the step that ends a run is the most important one of its log
+            step_s = self.ticker.now() - tick.start_s
+            record.reference, record.raw, record.step_ms = controller.target, controller.raw, step_s * 1e3
+            self.log(record)
+        controller.record(record.actuation)
+        self.statistics.add(record)
+        if self.warm_up is not None:
+            self.warm_up.step_took(step_s)
+        return sequence
 
     def _idle(self) -> None:
-        """Between two ticks: whether anybody wants to stop, and whether everybody is still there."""
+        """Between two steps: raises a stop request, and the loss of the board or the tracker."""
         self.stop.check()
         self.valves.check()
-        if self.slot.error is not None:
-            raise LostInRun(f"tracker lost: {self.slot.error}; check its cable and start again")
+        if self.frames.error is not None:
+            raise LostInRun(f"tracker lost: {self.frames.error}; check its cable and start again")
         # A frame just after a tick is young enough for the next one, so counting bad ticks alone could take a period
         # longer than the robot file allows.
-        frame, silence_s = self.slot.latest(), self.robot.limits.invalid_frames * self.robot.loop.period_s
-        # This is asked once a slice, so that the end is half a slice early at most, or half a slice late.
+        frame, silence_s = self.frames.latest(), self.robot.limits.invalid_frames * self.robot.loop.period_s
+        # The check runs once a slice, so the run ends half a slice early or late at most.
         if frame is not None and self.ticker.now() - frame.monotonic_s > silence_s - SLICE_S / 2:
             raise LostInRun(f"tracker: no new frame for {silence_s:.1f} s; look at the tracker, then start again")
 
-    def _acknowledged(self, step: int, sequence: int | None) -> dict[str, Any]:
-        """Whether the board has the set-points of `step` (None: it had none), and how long it took to say so."""
+    def _acknowledged(self, step: int, sequence: int | None) -> Acknowledgement:
+        """Whether the board has acknowledged the set-points of `step` (None: it sent none), and after what time."""
         status, latency_s = self.valves.status, self.valves.ack_latency_s
-        known = status is not None and status.acked_seq == sequence and latency_s is not None
-        told = {"tick": step, "ms": latency_s * 1e3 if known and latency_s is not None else None}
+        known = status is not None and status.acked_seq == sequence
+        acknowledged = Acknowledgement(step, latency_s * 1e3 if known and latency_s is not None else None)
         if step >= 0 and status is not None and sequence is not None:
-            self.tally.acknowledged(told["ms"])
-        return told
+            self.statistics.acknowledged(acknowledged.ms)
+        return acknowledged
 
-    def _board(self) -> dict[str, Any] | None:
-        """The last status of the board, for the log; None before the first."""
+    def _begun(
+        self,
+        tick: Tick,
+        frame: TrackerFrame | None,
+        check: FrameCheck,
+        controller: Controller,
+        acknowledged: Acknowledgement,
+    ) -> TickRecord:
+        """The record of a step that begins: what is known before its set-points."""
+        return TickRecord(
+            tick=tick.index,
+            mono_ns=_ns(tick.start_s),
+            due_ns=_ns(tick.due_s),
+            wall=datetime.now(UTC).isoformat(timespec="milliseconds"),
+            late_ms=tick.lateness_s * 1e3,
+            missed=tick.missed,
+            frame_status=check.word,
+            frame_detail=check.detail,
+            frame=None if frame is None else _frame_record(frame, check),
+            configuration=check.configuration,
+            desired=self.desired[tick.index],
+            board=self._board(),
+            acknowledged=acknowledged,
+            connection=self.valves.statistics,
+            actuation=controller.applied,
+        )
+
+    def _board(self) -> BoardRecord | None:
+        """The last status of the board; None before the first."""
         status = self.valves.status
         if status is None:
             return None
-        return {
-            "state": State(status.state).name if status.state in set(State) else str(status.state),
-            "faults": status.faults,
-            "tick": status.tick,
-            "applied_bar": self.valves.applied_bar,
-            "measured_bar": self.valves.measured_bar,
-            "age_ms": self.valves.status_age_s * 1e3,
-        }
+        return BoardRecord(
+            State(status.state).name if status.state in set(State) else str(status.state),
+            status.faults,
+            status.tick,
+            self.valves.applied_bar,
+            self.valves.measured_bar,
+            self.valves.status_age_s * 1e3,
+        )
 
 
-def _begun(tick: Tick, wall: datetime, frame: TrackerFrame | None, judged: FrameCheck) -> dict[str, Any]:
-    """The first part of a tick's line of the log: when it began, and with which frame."""
-    seen = None
-    if frame is not None:
-        seen = {
-            "number": frame.device_frame,
-            "mono_ns": _ns(frame.monotonic_s),
-            "age_ms": None if judged.age_s is None else judged.age_s * 1e3,
-            "poses": frame.poses,
-            "valid": frame.valid,
-            "quality": frame.quality,
-        }
-    return {
-        "tick": tick.index,
-        "mono_ns": _ns(tick.start_s),
-        "due_ns": _ns(tick.due_s),
-        "wall": wall.isoformat(timespec="milliseconds"),
-        "late_ms": tick.lateness_s * 1e3,
-        "missed": tick.missed,
-        "verdict": judged.word,
-        "detail": judged.detail,
-        "frame": seen,
-        "configuration": judged.configuration,
-    }
+def _frame_record(frame: TrackerFrame, check: FrameCheck) -> FrameRecord:
+    return FrameRecord(
+        frame.device_frame,
+        _ns(frame.monotonic_s),
+        frame.poses,
+        frame.valid,
+        frame.quality,
+        None if check.age_s is None else check.age_s * 1e3,
+        frame.port_status,
+    )
 
 
 def _ns(seconds: float) -> int:

@@ -41,6 +41,7 @@ from modsoft.runtime.errors import (
     UsageError,
 )
 from modsoft.runtime.files import read_text
+from modsoft.runtime.log_record import EndRecord
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameValidator, check_rest
@@ -186,17 +187,7 @@ def finish(
     if error is not None:
         code = error.exit_code if isinstance(error, ModsoftError) else INTERNAL_EXIT_CODE
         reason = str(error) or type(error).__name__
-    log.put(
-        {
-            "event": "end",
-            "mono_ns": began_ns,
-            "exit_code": code,
-            "reason": reason,
-            "vented": vented,
-            "vented_ns": vented_ns,
-            "still_bar": pressed,
-        }
-    )
+    log.put(EndRecord(began_ns, code, reason, vented, vented_ns, pressed))
     if board is None:
         word = "dry run, no valve was touched"
     else:
@@ -204,7 +195,7 @@ def finish(
     for line in [*tally.summary(), f"valves vented: {word}"]:  # before the log: a disk may hang
         _say(line)
     figures = {"figures": tally.figures(), "tracker": dict(slot.counts), "vented": vented}
-    log.close(code, reason, {**figures, "link": None if board is None else board.statistics})
+    log.close(code, reason, {**figures, "connection": None if board is None else board.statistics})
     _say(f"log: {log.folder}")
     if log.trouble:
         _say(f"log: {log.trouble}")

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import Any
 
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS
 from modsoft.runtime.clock import SPIN_S
 from modsoft.runtime.control.actuation import channel_pressures_bar, limited
 from modsoft.runtime.control.features import Window, state_of
+from modsoft.runtime.log_record import Record, WarmUpFailedRecord
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameValidator, check_actuation
 from modsoft.runtime.tracking.frame import TrackerFrame
@@ -38,7 +38,7 @@ class WarmUp:
         robot: Robot,
         actuate: Callable[[Array], Array],
         judge: FrameValidator,
-        log: Callable[[dict[str, Any]], None],
+        log: Callable[[Record], None],
         now: Callable[[], float] = time.monotonic,
     ):
         self._robot, self._actuate, self._judge, self._log, self._now = robot, actuate, judge, log, now
@@ -71,7 +71,7 @@ class WarmUp:
             self._run(frame, window, applied)
         except Exception as error:  # noqa: BLE001 - the control step decides whether it ends the run
             self._failed = True
-            self._log({"event": "warm-up failed", "reason": str(error) or type(error).__name__})
+            self._log(WarmUpFailedRecord(str(error) or type(error).__name__))
         took_s = self._now() - began_s
         self._fastest_run_s = min(self._fastest_run_s or took_s, took_s)
         self._runs += 1

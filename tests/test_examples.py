@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from log_records import tick_record
 
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.log import RunLog
@@ -42,14 +43,7 @@ def test_a_run_log_becomes_a_picture(tmp_path):
     for step in range(5):
         configuration = from_angles_deg(np.array([0.0, 5.0, 9.0]) * step)
         lost = None if step == 2 else configuration
-        log.put(
-            {
-                "tick": step,
-                "configuration": lost,
-                "desired": configuration,
-                "acknowledged": {"tick": step - 1, "ms": 1.0},
-            }
-        )
+        log.put(tick_record(step, configuration=lost, desired=configuration))
     log.close(0, "done", {})
     assert run("plot_run_log.py", str(log.folder), folder=tmp_path) == "angles.png\n"
     assert (tmp_path / "angles.png").read_bytes().startswith(b"\x89PNG")

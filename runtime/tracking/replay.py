@@ -4,37 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 
-from modsoft.runtime.errors import DeviceAbsent
-from modsoft.runtime.files import read_text
+from modsoft.runtime.errors import DeviceAbsent, ModelError
+from modsoft.runtime.log_reader import read_records
+from modsoft.runtime.log_record import FrameRecord, TickRecord
 from modsoft.runtime.tracking.frame import TrackerFrame
 
 LONGEST_GAP_NS = 3600 * 10**9  # between two frames of one run
-
-Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Number = Annotated[float, Meta(ge=-1e6, le=1e6)]  # mm, or no unit; null for a tool that was not seen
-
-
-class RecordedFrame(msgspec.Struct, frozen=True):
-    """A frame as run.jsonl has it; other keys are left alone."""
-
-    number: Count
-    mono_ns: Count
-    poses: list[list[list[Number | None]]]  # (N + 1, 4, 4)
-    valid: list[bool]  # (N + 1,)
-    quality: list[Number | None]  # (N + 1,)
-
-
-class RecordedLine(msgspec.Struct, frozen=True):
-    """A line of run.jsonl."""
-
-    frame: RecordedFrame | None = None
+LARGEST_NUMBER = 1e6  # mm, or without a unit
 
 
 class Replay:
@@ -52,7 +33,7 @@ class Replay:
         path = path / "run.jsonl" if path.is_dir() else path
         try:
             self._frames = list(recorded(path, tools))
-        except DeviceAbsent as error:
+        except ModelError as error:
             raise DeviceAbsent(f"tracker source replay: {error}; give the folder of a run of this robot") from error
         self._start_s = now()
         self._next = 0
@@ -67,7 +48,7 @@ class Replay:
             self._wait(min(due_s - self._now(), 0.05))
             return None
         self._next += 1
-        return TrackerFrame(frame.device_frame, due_s, frame.poses, frame.valid, frame.quality)
+        return replace(frame, monotonic_s=due_s)
 
     def close(self) -> None:
         self._frames = []
@@ -75,48 +56,40 @@ class Replay:
 
 
 def recorded(path: Path, tools: int) -> Iterator[TrackerFrame]:
-    """The frames of a run's log, each for `tools` tools; at least one. `DeviceAbsent` says which line is wrong."""
-    if path.exists() and not path.is_file():
-        raise DeviceAbsent(f"{path} is a device or pipe, expected the log of a run")
-    lines = read_text(path, DeviceAbsent).split("\n")
-    decode = msgspec.json.Decoder(RecordedLine).decode
-    before: int | None = None
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or _is_torn(line, number == len(lines)):
+    """The frames of a run's log, each for `tools` tools; at least one. Raises `ModelError` with the wrong line."""
+    before_ns: int | None = None
+    for number, record in read_records(path):
+        if not isinstance(record, TickRecord) or record.frame is None:
             continue
+        frame = record.frame
         try:
-            found = decode(line).frame
-            if found is None:
-                continue
-            yield _frame(found, tools)
-            if before is not None and not 0 <= found.mono_ns - before <= LONGEST_GAP_NS:
-                raise ValueError(f"mono_ns goes from {before} to {found.mono_ns}, expected the next frame of one run")
-            before = found.mono_ns
-        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            raise DeviceAbsent(f"{path}, line {number}: not a line of a run's log ({error})") from error
-    if before is None:
-        raise DeviceAbsent(f"no frame in {path}")
+            yield _frame(frame, tools)
+            if before_ns is not None and not 0 <= frame.mono_ns - before_ns <= LONGEST_GAP_NS:
+                raise ValueError(f"mono_ns from {before_ns} to {frame.mono_ns}, expected the next frame of one run")
+        except ValueError as error:
+            raise ModelError(f"{path}, line {number}: not a line of a run's log ({error})") from error
+        before_ns = frame.mono_ns
+    if before_ns is None:
+        raise ModelError(f"no frame in {path}")
 
 
-def _is_torn(line: str, is_last: bool) -> bool:
-    """Whether the writing of a line was cut: by a kill at the end of a log, by a full disk within it."""
-    if not line.startswith("{") or (line.endswith("}") and not is_last):
-        return False
-    try:
-        msgspec.json.decode(line)
-    except msgspec.DecodeError:
-        return True
-    except RecursionError:
-        pass
-    return False
-
-
-def _frame(found: RecordedFrame, tools: int) -> TrackerFrame:
-    """ValueError where its arrays do not fit `tools` tools."""
+def _frame(recorded: FrameRecord, tools: int) -> TrackerFrame:
+    """Raises ValueError where the arrays do not fit `tools` tools."""
     for name in ("poses", "valid", "quality"):
-        if (count := len(getattr(found, name))) != tools:
+        values = getattr(recorded, name)
+        if (count := len(values)) != tools:
             raise ValueError(f"{name} of {count} tools, expected {tools}: the base and {tools - 1} modules")
-    if any([len(pose), *map(len, pose)] != [4] * 5 for pose in found.poses):
-        raise ValueError("poses that are not all 4 x 4")
-    poses, quality = (np.array(rows, dtype=np.float64) for rows in (found.poses, found.quality))  # null becomes NaN
-    return TrackerFrame(found.number, found.mono_ns * 1e-9, poses, np.array(found.valid, dtype=bool), quality)
+        if (np.abs(values) > LARGEST_NUMBER).any():
+            raise ValueError(f"{name} beyond {LARGEST_NUMBER:g}")
+        if values.shape[1:] != ((4, 4) if name == "poses" else ()):
+            raise ValueError(f"{name} of shape {values.shape}, expected {tools} poses of 4 x 4 with one value a tool")
+    if recorded.port_status is not None and len(recorded.port_status) != tools:
+        raise ValueError(f"port_status of {len(recorded.port_status)} tools, expected {tools}")
+    return TrackerFrame(
+        recorded.number,
+        recorded.mono_ns * 1e-9,
+        recorded.poses,
+        recorded.valid,
+        recorded.quality,
+        port_status=recorded.port_status,
+    )

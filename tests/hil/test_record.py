@@ -5,9 +5,11 @@ import math
 
 import numpy as np
 import pytest
+from log_records import tick_record
 
 from modsoft.hil import criteria, record, report
 from modsoft.runtime import robot as robots
+from modsoft.runtime.log_record import SCHEMA, HeaderRecord, StartRecord, encode
 
 READY = {"event": "ready", "channels": 3, "t_us": 0.0, "mono_ns": 0}
 OPENED = {"event": "pwm", "t_us": 1e3, "mono_ns": 1_000_000, "channel": 0, "duty": 0.25, "raw": [1023, 4095]}
@@ -27,20 +29,8 @@ def test_a_line_cut_by_a_kill_is_left_out(tmp_path):
 
 
 def tick(number, commanded):
-    return {
-        "tick": number,
-        "mono_ns": 400_000_000 * number,
-        "late_ms": 0.5,
-        "missed": 0,
-        "verdict": "good",
-        "frame": None,
-        "sent": commanded is not None,
-        "desired": [[0, 0, 1]] * 3,
-        "configuration": [[0, 0, 1]] * 3,
-        "board": None,
-        "acknowledged": {"tick": number - 1, "ms": 7.0},
-        "commanded_bar": commanded,
-    }
+    bar = None if commanded is None else np.array(commanded)
+    return tick_record(number, sent=bar is not None, commanded_bar=bar)
 
 
 @pytest.fixture
@@ -48,9 +38,10 @@ def run_folder(tmp_path):
     """A run of two ticks, the first of which sent nothing: `folder` with what the rig wrote and the runtime's log."""
 
     def write(slew=20000, start=True):
-        run = [{"event": "start", "mono_ns": -400_000_000, "commanded_bar": [0.08] * 6 + [0] * 6}] if start else []
-        run += [tick(0, None), tick(1, [0.2] * 6 + [0] * 6)]
-        for name, events in {"run": run, "board": [READY, OPENED], "plant": []}.items():
+        first = [StartRecord(-400_000_000, np.array([0.08] * 6 + [0] * 6))] if start else []
+        run = [HeaderRecord(SCHEMA), *first, tick(0, None), tick(1, [0.2] * 6 + [0] * 6)]
+        (tmp_path / "run.jsonl").write_bytes(b"".join(encode(record) + b"\n" for record in run))
+        for name, events in {"board": [READY, OPENED], "plant": []}.items():
             (tmp_path / f"{name}.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
         (tmp_path / "meta.json").write_text(json.dumps({"board": {"slew": slew} if slew else None}))
         (tmp_path / "runtime.err").write_text("one\ntoo late\n")

@@ -20,10 +20,10 @@ from modsoft.hil.board import emulator
 from modsoft.hil.outputs import emulated_us, read_outputs
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child, Rig
-from modsoft.runtime import log
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control.features import angle_between_deg
 from modsoft.runtime.control.tasks import load_task
+from modsoft.runtime.log_reader import Follower, read
 
 SCRIPTS = Path(sys.executable).parent
 
@@ -74,9 +74,9 @@ def as_in_collection(found, run_folder):
     arm = Arm(found.robot.kind, found.robot.modules)
     arm.step(np.zeros((found.robot.modules, 1)))  # the period before the first tick
     there = []
-    for tick in log.read(run_folder).ticks:
+    for tick in read(run_folder).ticks:
         there.append(arm.configuration)
-        arm.step(np.array(tick["actuation"]))
+        arm.step(tick.actuation)
     return np.array(there)
 
 
@@ -122,7 +122,7 @@ def test_a_killed_runtime_leaves_every_valve_at_0_within_700_ms(strong_model, tm
 
 def ticked(folder):
     """Whether a run that logs below `folder` has begun."""
-    return any(b'\n{"tick"' in log.read_bytes() for log in folder.glob("runtime-log-*/*/run.jsonl"))
+    return any(Follower(path).new() for path in folder.glob("runtime-log-*/*/run.jsonl"))
 
 
 def rig_command(folder, model):

@@ -9,14 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from log_records import tick_record
 from reference_run import COUNTS, reference_run, slewed, with_output
 
 from modsoft.hil import soak as soaks
-from modsoft.hil.faults import FAULTS, Log
+from modsoft.hil.faults import FAULTS
 from modsoft.hil.outputs import read_outputs
 from modsoft.hil.post_fault_checks import Injected, Ran, judge_fault, judge_log, judge_valves, judge_vent
-from modsoft.runtime import log as logs
+from modsoft.runtime.log_reader import Run, read
+from modsoft.runtime.log_record import EndRecord, StartRecord
 
+START = StartRecord(0, np.zeros(12))
 TOOL = Path(__file__).parents[2] / "tools" / "soak.py"
 PASSING = next(fault for fault in FAULTS if fault.name == "tool hidden for a moment")
 ENDING = next(fault for fault in FAULTS if fault.name == "cable pulled")
@@ -37,19 +40,6 @@ def test_faults_are_of_the_matrix_and_say_what_must_follow():
         assert fault.goes_by or fault.codes, f"{fault.name}: nothing follows"
         assert re.compile(fault.says)
     assert len([fault for fault in FAULTS if not fault.codes]) >= 5, "for the first third"
-
-
-def test_the_log_is_read_as_it_grows_and_only_in_whole_lines(tmp_path):
-    path = tmp_path / "run.jsonl"
-    path.write_bytes(b'{"event":"start"}\n{"tick":0}\n{"tick":1')
-    log = Log(path)
-    assert [line["tick"] for line in log.new()] == [0]
-    with path.open("ab") as file:
-        file.write(b"1}\n")
-    assert [line["tick"] for line in log.new()] == [11]
-    assert log.new() == []
-    assert log.last == {"tick": 11}
-    log.close()
 
 
 # ---- A fault
@@ -168,7 +158,7 @@ def test_the_vent_takes_as_long_as_the_ramp_or_the_board_alone(reference, code, 
 
 def log_of(**changed):
     meta = {"exit_code": 74, "lines_lost": 0, "reason": "board lost"} | changed
-    return logs.Run(meta, [{"tick": 0}, {"tick": 2}], [{"event": "start"}, {"event": "end"}])
+    return Run(meta, [tick_record(0), tick_record(2)], [START, EndRecord(0, 0, "done", True, 0, {})])
 
 
 @pytest.mark.parametrize(
@@ -178,8 +168,8 @@ def log_of(**changed):
         (log_of(), "", ["the log and the terminal give different reasons"]),
         (log_of(exit_code=None), "board lost", ["the log says exit code None"]),
         (log_of(lines_lost=2), "board lost", ["2 lines of the log lost"]),
-        (log_of()._replace(ticks=[{"tick": 2}, {"tick": 0}]), "board lost", ["ticks of the log out of order"]),
-        (log_of()._replace(events=[{"event": "start"}]), "board lost", ["the log has no end"]),
+        (log_of()._replace(ticks=[tick_record(2), tick_record(0)]), "board lost", ["ticks of the log out of order"]),
+        (log_of()._replace(events=[START]), "board lost", ["the log has no end"]),
     ],
 )
 def test_a_log_is_whole_and_says_what_the_terminal_said(read, said, wrong):
@@ -226,5 +216,5 @@ def test_a_short_soak(tool, model_file, tmp_path, monkeypatch):
     assert left.value.code == 0, page
     assert all(f"| {fault.name} |" in page for fault in chosen), page
     [folder] = out.iterdir()
-    assert logs.read(next((folder / "run-001").glob("*/"))).meta["exit_code"] == 74
+    assert read(next((folder / "run-001").glob("*/"))).meta["exit_code"] == 74
     assert json.loads((folder / "run-002" / "board.jsonl").read_text().splitlines()[0])["event"] == "ready"

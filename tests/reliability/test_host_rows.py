@@ -158,10 +158,10 @@ def test_row_26_starved_processor(matrix_row, full):
             assert "no new frame" in reason  # it was away for as long as a tracker may be
         least_s = min(least_s, *(b - a for (a, *_), (b, *_) in itertools.pairwise(world.sent)), np.inf)
         sets += len(world.sent)
-        ran = [line["tick"] for line in world.ticks]
+        ran = [record.tick for record in world.ticks]
         assert ran == sorted(set(ran))
-        assert sum(line["missed"] for line in world.ticks) + len(ran) == (ran[-1] + 1 if ran else 0)
-        assert all(0.0 <= line["late_ms"] <= 1e3 * PERIOD_S / 2 + 1e-6 for line in world.ticks)
+        assert sum(record.missed for record in world.ticks) + len(ran) == (ran[-1] + 1 if ran else 0)
+        assert all(0.0 <= record.late_ms <= 1e3 * PERIOD_S / 2 + 1e-6 for record in world.ticks)
         silent = longest_silence(world.ticks)
         assert silent <= MISSED_IN_A_ROW or "control ticks in a row were missed" in reason
         ended += "control ticks in a row were missed" in reason
@@ -180,10 +180,10 @@ def test_row_26_starved_processor(matrix_row, full):
 def longest_silence(ticks):
     """Of the ticks in a row that sent nothing, the most."""
     most = now = 0
-    for line in ticks:
-        now = now + line["missed"] if line["sent"] else now + line["missed"] + 1
+    for record in ticks:
+        now = now + record.missed if record.sent else now + record.missed + 1
         most = max(most, now)
-        now = 0 if line["sent"] else now
+        now = 0 if record.sent else now
     return most
 
 
@@ -213,11 +213,11 @@ def test_row_27_wall_clock_steps(matrix_row, full, model_file, tmp_path, steppin
         if again and (code, len(log.ticks)) != (0, steps):
             return attempt(number, again - 1)  # a starved host misses ticks, and then its commands are others
         assert code == 0, run.said
-        walls = [datetime.fromisoformat(line["wall"]).timestamp() for line in log.ticks]
+        walls = [datetime.fromisoformat(record.wall).timestamp() for record in log.ticks]
         stepped = sum(abs(b - a - PERIOD_S) > 60 for a, b in itertools.pairwise(walls))
         assert (stepped > steps / 2) == (number > 0)
-        assert all(line["verdict"] == "good" for line in log.ticks)
-        return [line["commanded_bar"] for line in log.ticks], stepped
+        assert all(record.frame_status == "good" for record in log.ticks)
+        return [record.commanded_bar.tolist() for record in log.ticks], stepped
 
     results = side_by_side(tries + 1, attempt, 3)
     (calm, _), *others = results

@@ -49,11 +49,13 @@ def test_rows_13_14_15_18_19_tracker_in_trouble_on_the_line(matrix_row, full, mo
             assert stand.highest_bar() == 0.0
             log = run.log()
             assert log.meta["vented"]
-            bad = [line for line in log.ticks if line["verdict"] != "good"]
+            bad = [record for record in log.ticks if record.frame_status != "good"]
             assert log.ticks[len(log.ticks) - len(bad) :] == bad, "once lost, never used again"
-            assert all(line["commanded_bar"] == log.ticks[-1 - len(bad)]["commanded_bar"] for line in bad[:-1])
-            took_s = (log.events[-1]["mono_ns"] - began_ns) * 1e-9
-        late_ms = max(line["late_ms"] for line in log.ticks[-4:])
+            assert all(
+                np.array_equal(record.commanded_bar, log.ticks[-1 - len(bad)].commanded_bar) for record in bad[:-1]
+            )
+            took_s = (log.events[-1].mono_ns - began_ns) * 1e-9
+        late_ms = max(record.late_ms for record in log.ticks[-4:])
         if took_s > LATER_LIMITS_S.get(name, LIMIT_S) and again and late_ms > LATE_HOST_MS:
             return attempt(number, again - 1)  # the log itself says that this host had no time
         return took_s
@@ -81,13 +83,13 @@ def test_row_18_one_bad_moment_is_waited_out_on_the_line(matrix_row, model_file,
         for _ in range(3):
             before = run.ticks()
             stand.tracker.send({"hide": [1]})
-            run.wait_for(lambda: '"verdict":"tool hidden"' in run.log_text().splitlines()[-1], 5)
+            run.wait_for(lambda: run.last_tick().frame_status == "tool hidden", 5)
             stand.tracker.send({"hide": []})
             run.wait_for(lambda before=before: run.ticks() >= before + 3, 5)
         run.process.send_signal(signal.SIGINT)
         assert run.left()[0] == 130, run.said
         log = run.log()
-    held = [line for line in log.ticks if line["verdict"] != "good"]
+    held = [record for record in log.ticks if record.frame_status != "good"]
     assert 3 <= len(held) <= 6
     assert log.meta["figures"]["held"] == {"tool hidden": len(held)}
     matrix_row(

@@ -30,12 +30,12 @@ VENTED_MS = 670  # from the last frame: the link's time-out, and the ramp from t
 def never_a_burst(log):
     """What the log says of its ticks is true of their times, and no two that sent something came close to each other:
     the smallest gap, seconds."""
-    for line in log.ticks:
-        assert line["late_ms"] == pytest.approx((line["mono_ns"] - line["due_ns"]) * 1e-6, abs=1e-3)
-    for before, line in itertools.pairwise(log.ticks):
-        assert line["tick"] - before["tick"] == line["missed"] + 1
-        assert line["due_ns"] - before["due_ns"] == pytest.approx((line["missed"] + 1) * PERIOD_S * 1e9, abs=1e3)
-    began_s = 1e-9 * np.array([line["mono_ns"] for line in log.ticks if line["sent"]])
+    for tick in log.ticks:
+        assert tick.late_ms == pytest.approx((tick.mono_ns - tick.due_ns) * 1e-6, abs=1e-3)
+    for before, tick in itertools.pairwise(log.ticks):
+        assert tick.tick - before.tick == tick.missed + 1
+        assert tick.due_ns - before.due_ns == pytest.approx((tick.missed + 1) * PERIOD_S * 1e9, abs=1e3)
+    began_s = 1e-9 * np.array([tick.mono_ns for tick in log.ticks if tick.sent])
     assert np.all(np.diff(began_s) >= PERIOD_S / 2)
     return float(np.diff(began_s).min(initial=np.inf))
 
@@ -68,10 +68,10 @@ def test_row_26_one_core_with_four_busy_processes(matrix_row, full, strong_model
         assert code in (0, *GAVE_UP), run.said
         assert stand.highest_bar() == 0.0
     gap_s = never_a_burst(log)
-    late_ms = np.array([line["late_ms"] for line in log.ticks])
+    late_ms = np.array([tick.late_ms for tick in log.ticks])
     figures = log.meta["figures"]
     assert figures["late_ms"]["max"] == pytest.approx(late_ms.max(), abs=1e-6)
-    assert figures["missed"] == sum(line["missed"] + (not line["sent"]) for line in log.ticks)
+    assert figures["missed"] == sum(tick.missed + (not tick.sent) for tick in log.ticks)
     p50, p99 = np.percentile(late_ms, [50, 99], method="higher")
     late = f"late {p50:.1f} ms (median), {p99:.1f} ms (p99), {late_ms.max():.1f} ms (largest)"
     matrix_row(
@@ -140,9 +140,9 @@ def test_row_26_halted_for_50_to_600_ms(matrix_row, full, strong_model, tmp_path
                 vented_ms = read_outputs(events).vented_after_ms(emulated_us(events, began_ns))
                 assert vented_ms <= VENTED_MS
             else:
-                faults = {line["board"]["faults"] for line in log.ticks if line["board"]}
+                faults = {tick.board.faults for tick in log.ticks if tick.board}
                 assert not any(fault & Fault.LINK_TIMEOUT for fault in faults)
-            late_ms = max(line["late_ms"] for line in log.ticks)
+            late_ms = max(tick.late_ms for tick in log.ticks)
             return halt_s, went_on, gap_s, late_ms, vented_ms
 
     results = side_by_side(len(phases_s), attempt, AT_ONCE)

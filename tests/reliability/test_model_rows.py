@@ -180,9 +180,9 @@ def test_row_22_model_gives_nan_on_the_board(matrix_row, full, model_file, tmp_p
             assert stand.highest_bar() == 0.0
             log = run.log()
         assert len(log.ticks) >= 4
-        assert [line["sent"] for line in log.ticks] == [True] * (len(log.ticks) - 1) + [False]
+        assert [record.sent for record in log.ticks] == [True] * (len(log.ticks) - 1) + [False]
         assert log.meta["vented"]
-        assert run.closed_ns() < log.events[-1]["vented_ns"]
+        assert run.closed_ns() < log.events[-1].vented_ns
 
     side_by_side(len(values), attempt, 4)
     matrix_row(

@@ -27,7 +27,7 @@ def unforeseen(run):
 
 
 def lose_tracker(run):
-    run.slot.error = OSError("unplugged")
+    run.frames.error = OSError("unplugged")
 
 
 CAUSES = {

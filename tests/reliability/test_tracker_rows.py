@@ -5,12 +5,13 @@ import itertools
 
 import numpy as np
 import pytest
-from virtual_loop import PERIOD_S, ROBOT, World, planar_poses, spoils
+from virtual_loop import PERIOD_S, ROBOT, World, corrupting, planar_poses
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime import safety
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.errors import LostInRun, Tripped
+from modsoft.runtime.log_record import TickRecord
 from modsoft.runtime.safety import FrameValidator
 from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 
@@ -21,7 +22,7 @@ RUN_S = 8 * PERIOD_S  # of a run before its fault
 def ended(world):
     """Runs until the tracker ends the run; seconds from the last good frame to the start of the venting."""
     good_s = []
-    world.loop.judge.judge, judge = lambda *told: noted(judge(*told), told[0], good_s), world.loop.judge.judge
+    world.loop.validator.judge, judge = lambda *told: noted(judge(*told), told[0], good_s), world.loop.validator.judge
     with pytest.raises((LostInRun, Tripped)):
         world.run()
     return world.time_s - good_s[-1]
@@ -36,11 +37,11 @@ def noted(judged, frame, good_s):
 def held(world):
     """Checks that each tick without a good frame sent the command of the tick before; how many there were."""
     count = 0
-    for before, line in itertools.pairwise(world.ticks):
-        if line["verdict"] != "good":
-            assert line["raw"] is None
-            assert line["configuration"] is None
-            assert np.array_equal(line["actuation"], before["actuation"])
+    for before, record in itertools.pairwise(world.ticks):
+        if record.frame_status != "good":
+            assert record.raw is None
+            assert record.configuration is None
+            assert np.array_equal(record.actuation, before.actuation)
             count += 1
     return count
 
@@ -95,9 +96,9 @@ def test_row_14_tracker_frozen(matrix_row, full):
         world.frame_age_s = rng.uniform(0.002, 0.045)
         frozen_s = world.time_s + rng.uniform(PERIOD_S, RUN_S)
         number = int(frozen_s * 60)
-        world.spoilt.append((frozen_s, np.inf, spoils(device_frame=number)))  # fresh by the host's clock
+        world.corrupted.append((frozen_s, np.inf, corrupting(device_frame=number)))  # fresh by the host's clock
         worst_s = max(worst_s, ended(world))
-        used = [line for line in world.ticks if line["verdict"] == "good" and line["frame"]["number"] == number]
+        used = [record for record in world.ticks if record.frame_status == "good" and record.frame.number == number]
         worst = max(worst, len(used) + 1)
     matrix_row(
         14,
@@ -110,17 +111,17 @@ def test_row_14_tracker_frozen(matrix_row, full):
     assert worst <= 3
     assert worst_s <= VENT_LIMIT_S
 
-    verdicts, hours = [], 10 if full else 1
+    statuses, hours = [], 10 if full else 1
     for drift in (-1e-4, 1e-4):
         world = World(steps=round(hours / 2 * 3600 / PERIOD_S))
-        world.log = lambda line: verdicts.append(line["verdict"]) if "tick" in line else None
+        world.log = lambda record: statuses.append(record.frame_status) if isinstance(record, TickRecord) else None
         world.frame = lambda drift=drift, world=world: noise(rng, world.time_s, drift)
         world.run()
-    alarms = len(verdicts) - verdicts.count("good")
+    alarms = len(statuses) - statuses.count("good")
     matrix_row(
         14,
         fault="none: noise of 0.5 mm and 0.5 degrees, jitter of the line, clocks 100 ppm apart",
-        tries=len(verdicts),
+        tries=len(statuses),
         limit=f"no false alarm in {hours} h",
         worst=alarms,
         clock="virtual",
@@ -172,7 +173,7 @@ def test_row_15_delayed(matrix_row, full):
 def test_row_16_nan(matrix_row, full):
     rng, tries = np.random.default_rng(16), 100_000 if full else 10_000
     world = restless(World(steps=round(1.5 * tries)))
-    world.log = lambda line: counts.append(line["verdict"]) if "tick" in line else None
+    world.log = lambda record: counts.append(record.frame_status) if isinstance(record, TickRecord) else None
     counts, frame = [], world.frame
 
     def sometimes(**changes):
@@ -212,14 +213,14 @@ def test_row_17_outlier(matrix_row, full):
         angles[module] = rng.choice([-1, 1]) * rng.uniform(1.05 * fastest_deg, 180.0)
         poses = planar_poses(angles)
         at_s = world.due_s(6) - world.frame_age_s
-        world.spoilt.append((at_s - rng.uniform(0.0, PERIOD_S / 2), at_s + 0.001, spoils(poses=poses)))
+        world.corrupted.append((at_s - rng.uniform(0.0, PERIOD_S / 2), at_s + 0.001, corrupting(poses=poses)))
         world.run()
-        refused = [line["tick"] for line in world.ticks if line["verdict"] != "good"]
+        refused = [record.tick for record in world.ticks if record.frame_status != "good"]
         assert refused[0] == 6
-        assert world.ticks[6]["verdict"] in (safety.JUMP, safety.SWAPPED, safety.REVERSED)
+        assert world.ticks[6].frame_status in (safety.JUMP, safety.SWAPPED, safety.REVERSED)
         assert held(world) == len(refused)
         worst = max(worst, len(refused))
-        used = [line["configuration"] for line in world.ticks if line["verdict"] == "good"]
+        used = [record.configuration for record in world.ticks if record.frame_status == "good"]
         assert np.all(bending_angle_deg(used) == 0.0)
     matrix_row(
         17,
@@ -241,13 +242,13 @@ def random_partial(rng, count):
         case 0:
             valid = np.ones(count, bool)
             valid[rng.choice(count, rng.integers(1, count + 1), replace=False)] = False
-            return "hidden", spoils(valid=valid)
+            return "hidden", corrupting(valid=valid)
         case 1:
             tools = rng.choice([tools for tools in (0, 1, 2, 3, 4, 5, 8) if tools != count])
             parts = {"poses": np.tile(np.eye(4), (tools, 1, 1)), "valid": np.ones(tools, bool)}
-            return "wrong number", spoils(**parts, quality=np.full(tools, 0.1))
+            return "wrong number", corrupting(**parts, quality=np.full(tools, 0.1))
         case 2:
-            return "wrong number", spoils(valid=np.ones(rng.choice([0, 1, count - 1, count + 1]), bool))
+            return "wrong number", corrupting(valid=np.ones(rng.choice([0, 1, count - 1, count + 1]), bool))
         case _:
             order = np.arange(count)
             while np.array_equal(order, np.arange(count)):
@@ -264,9 +265,9 @@ def test_row_18_hidden_wrong_number_swapped(matrix_row, full):
         world.angles = tuple(rng.uniform(-1, 1, len(ROBOTS[name])) * ROBOTS[name])
         what, spoil = random_partial(rng, len(ROBOTS[name]) + 1)
         kinds.add(what)
-        world.spoilt.append((world.time_s + rng.uniform(PERIOD_S, RUN_S), np.inf, spoil))
+        world.corrupted.append((world.time_s + rng.uniform(PERIOD_S, RUN_S), np.inf, spoil))
         worst_s = max(worst_s, ended(world))
-        bad = [line for line in world.ticks if line["verdict"] != "good"]
+        bad = [record for record in world.ticks if record.frame_status != "good"]
         assert len(bad) == 3
         assert world.ticks[-3:] == bad
         held(world)

@@ -1,4 +1,4 @@
-"""The run log: every line at once, nothing lost to a kill, and no harm from a full disk."""
+"""Writing the run log: every record at once, nothing lost to a kill, and no harm from a full disk."""
 
 import errno
 import json
@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modsoft.runtime import log as logs
-from modsoft.runtime.errors import ModelError, UsageError
+from modsoft.runtime.errors import UsageError
+from modsoft.runtime.log_record import SCHEMA, encode
 
 NOW = datetime(2025, 3, 4, 5, 6, 7, tzinfo=UTC)
 
@@ -25,12 +26,12 @@ def a_log(folder: Path) -> logs.RunLog:
 
 
 def wait_for(condition) -> None:
-    """The writer's thread is another one: it is given its turn, not a time."""
+    """Gives the thread of the writer its turn until it is so."""
     for _ in range(5000):
         if condition():
             return
         threading.Event().wait(0.001)
-    raise AssertionError("the log's thread never got there")
+    raise AssertionError("the log's thread never did it")
 
 
 def test_folder_and_files(tmp_path):
@@ -54,7 +55,7 @@ def test_two_runs_in_one_second(tmp_path):
     second.close(0, "done", {})
 
 
-def test_no_place_to_log_is_a_usage_error(tmp_path):
+def test_a_folder_that_cannot_be_made_is_a_usage_error(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="--runs-dir"):
         a_log(tmp_path / "file")
@@ -65,8 +66,10 @@ def test_a_line_is_in_the_file_before_the_log_is_closed(tmp_path):
     path = log.folder / "run.jsonl"
     for tick in range(3):
         log.put({"tick": tick, "value": np.float64(0.5)})
-        wait_for(lambda tick=tick: path.read_bytes().count(b"\n") == tick + 1)
-    assert [json.loads(line) for line in path.read_text().splitlines()][2] == {"tick": 2, "value": 0.5}
+        wait_for(lambda tick=tick: path.read_bytes().count(b"\n") == tick + 2)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert lines[0] == {"event": "header", "schema": SCHEMA}
+    assert lines[3] == {"tick": 2, "value": 0.5}
     log.close(0, "done", {})
 
 
@@ -79,18 +82,30 @@ VALUES = st.recursive(
 
 @given(VALUES)
 def test_every_value_becomes_strict_json(value):
-    text = json.dumps(logs.plain(value), allow_nan=False)
-    assert "\n" not in text
-    json.loads(text)
+    text = encode(value)
+    assert b"\n" not in text
+    json.loads(text, parse_constant=pytest.fail)
 
 
 def test_arrays_and_nan_become_lists_and_null():
-    value = {"a": np.array([[1.0, np.nan]]), "b": np.int64(3), "c": (np.inf, np.True_), "d": 1 / 3}
-    assert logs.plain(value) == {"a": [[1.0, None]], "b": 3, "c": [None, True], "d": 0.333333333}
+    value = {"a": np.array([[1.0, np.nan]]), "b": np.int64(3), "c": (np.inf, np.True_), "d": np.array([1 / 3])}
+    value |= {"e": np.array([True]), 5: np.float64(0.5)}
+    assert json.loads(encode(value)) == {
+        **{"a": [[1.0, None]], "b": 3, "c": [None, True], "d": [0.333333333]},
+        **{"e": [True], "5": 0.5},
+    }
+
+
+def test_a_file_name_that_is_not_utf_8_can_be_logged(tmp_path):
+    name = os.fsdecode(b"model-\xff.onnx")
+    assert json.loads(encode({name: [name, np.nan]})) == {"model-\\udcff.onnx": ["model-\\udcff.onnx", None]}
+    log = logs.RunLog(tmp_path, "arm", "", {"command": [name]})
+    log.close(65, f"no model {name}", {})
+    assert json.loads((log.folder / "meta.json").read_text())["reason"] == "no model model-\\udcff.onnx"
 
 
 class Disk:
-    """`os.write` of a disk with so much room, which gives it back when asked."""
+    """`os.write` of a disk with this much room."""
 
     def __init__(self, room: int):
         self.room = room
@@ -118,7 +133,7 @@ def test_full_disk_loses_lines_but_raises_nothing_and_recovers(tmp_path):
     assert (tmp_path / "run.jsonl").read_bytes() == b'{"tick":0}\n{"tick":1}\n{"t\n{"tick":4}\n'
 
 
-def test_a_disk_that_hangs_does_not_hold_the_loop(tmp_path):
+def test_a_disk_that_hangs_does_not_stop_the_loop(tmp_path):
     freed = threading.Event()
 
     def hang(file: int, data: bytes) -> int:
@@ -134,7 +149,7 @@ def test_a_disk_that_hangs_does_not_hold_the_loop(tmp_path):
 
 
 @pytest.mark.parametrize("lines", [3, logs.QUEUE_LINES + 1])
-def test_what_a_hanging_disk_still_owes_at_the_end_is_told(tmp_path, monkeypatch, lines):
+def test_records_that_a_hanging_disk_did_not_write_are_counted(tmp_path, monkeypatch, lines):
     freed, begun = threading.Event(), threading.Event()
 
     def hang(file: int, data: bytes) -> int:
@@ -155,10 +170,10 @@ def test_what_a_hanging_disk_still_owes_at_the_end_is_told(tmp_path, monkeypatch
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_what_a_bug_in_the_writer_cost_is_told(tmp_path):
+def test_records_lost_to_a_bug_in_the_writer_are_counted(tmp_path):
     writer = logs.Writer(tmp_path / "run.jsonl")
     writer.put({"tick": 0})
-    writer.put({"tick": 1, "of no kind that JSON knows": object()})
+    writer.put({"tick": 1, "not JSON": object()})
     writer.put({"tick": 2})
     writer.close()
     assert writer.lost == 2
@@ -189,7 +204,7 @@ def test_a_real_full_device(tmp_path):
     assert (writer.lost, writer.error) == (1, os.strerror(errno.ENOSPC))
 
 
-WRITES_FOR_EVER = """
+WRITES_UNTIL_KILLED = """
 import sys
 from pathlib import Path
 from modsoft.runtime.log import RunLog
@@ -203,58 +218,17 @@ sys.stdin.read()
 
 def test_a_killed_process_has_lost_nothing(tmp_path):
     with subprocess.Popen(
-        [sys.executable, "-c", WRITES_FOR_EVER, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", WRITES_UNTIL_KILLED, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
         assert process.stdout.readline() == b"put\n"
         [path] = tmp_path.glob("*/run.jsonl")
         wait_for(lambda: path.read_bytes().endswith(b'{"tick":99}\n'))
         process.kill()
-    assert [json.loads(line)["tick"] for line in path.read_text().splitlines()] == list(range(100))
+    assert [json.loads(line)["tick"] for line in path.read_text().splitlines()[1:]] == list(range(100))
     assert json.loads((path.parent / "meta.json").read_text())["exit_code"] is None
 
 
-def test_reading_gives_each_tick_its_own_acknowledgement(tmp_path):
-    log = a_log(tmp_path)
-    log.put({"event": "start"})
-    log.put({"tick": 0, "acknowledged": {"tick": -1, "ms": 5.0}})
-    log.put({"tick": 1, "acknowledged": {"tick": 0, "ms": 7.0}})
-    log.put({"tick": 2, "acknowledged": {"tick": 1, "ms": None}})
-    log.close(0, "done", {})
-    with (log.folder / "run.jsonl").open("a") as torn:
-        torn.write('{"tick": 3, "ack')
-    run = logs.read(log.folder)
-    assert [line["tick"] for line in run.ticks] == [0, 1, 2]
-    assert [line["acknowledged"]["ms"] for line in run.ticks] == [7.0, None, None]
-    assert [line["event"] for line in run.events] == ["start"]
-    assert run.meta["exit_code"] == 0
-
-
-def test_reading_what_is_no_run(tmp_path):
-    with pytest.raises(ModelError, match="no folder of a run"):
-        logs.read(tmp_path)
-
-
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_a_run_that_an_editor_of_windows_saved_is_read(tmp_path, encoding):
-    log = a_log(tmp_path)
-    log.put({"tick": 0, "acknowledged": None})
-    log.close(0, "done", {})
-    for name in ("meta.json", "run.jsonl"):
-        path = log.folder / name
-        path.write_bytes(path.read_text().replace("\n", "\r\n").encode(encoding))
-    assert [line["tick"] for line in logs.read(log.folder).ticks] == [0]
-
-
-@pytest.mark.parametrize("acknowledged", [{"ms": 1}, [1], 1, "x"])
-def test_reading_an_edited_run(tmp_path, acknowledged):
-    log = a_log(tmp_path)
-    log.put({"tick": 0, "acknowledged": acknowledged})
-    log.close(0, "done", {})
-    with pytest.raises(ModelError, match="not the log of a run"):
-        logs.read(log.folder)
-
-
-def test_a_folder_of_runs_may_be_a_link_to_one_that_is_not_there_yet(tmp_path):
+def test_the_folder_of_runs_may_be_a_link_to_a_missing_folder(tmp_path):
     (tmp_path / "runs").symlink_to(tmp_path / "disk" / "runs")
     log = a_log(tmp_path / "runs")
     log.close(0, "done", {})

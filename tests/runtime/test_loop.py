@@ -1,5 +1,6 @@
 """The loop on virtual time."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,7 +19,8 @@ from modsoft.runtime.control.features import (
     state_of,
 )
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
-from modsoft.runtime.log import plain
+from modsoft.runtime.log_reader import Run
+from modsoft.runtime.log_record import DoneRecord, StartRecord, TickRecord, encode
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Interrupted, StopKey
@@ -28,26 +30,26 @@ REST = np.array([[0.0, 0.0, 1.0]] * 3)
 
 def test_a_whole_task():
     world = World(steps=10).run()
-    assert [line["tick"] for line in world.ticks] == list(range(10))
+    assert [record.tick for record in world.ticks] == list(range(10))
     assert [tick for _, tick, _ in world.sent] == list(range(11))  # actuation 0 first, then every step
     times = np.array([at_s for at_s, *_ in world.sent])
     np.testing.assert_allclose(np.diff(times), [PERIOD_S + 0.001] + [PERIOD_S] * 9, atol=1e-6)
     zero = channel_pressures_bar(ROBOT, np.zeros((3, 1)), CHANNELS)
     assert np.array_equal(world.sent[0][2], zero)
-    for line, (_, _, pressures) in zip(world.ticks, world.sent[1:], strict=True):
-        assert np.array_equal(line["commanded_bar"], pressures)
-        assert (line["sent"], line["verdict"], line["missed"]) == (True, "good", 0)
+    for record, (_, _, pressures) in zip(world.ticks, world.sent[1:], strict=True):
+        assert np.array_equal(record.commanded_bar, pressures)
+        assert (record.sent, record.frame_status, record.missed) == (True, "good", 0)
     # it returns one period after the last step, so that the last command has had its time
     assert world.time_s == pytest.approx(500.0 + 11 * PERIOD_S)
-    assert [line["event"] for line in world.lines if "event" in line] == ["start", "done"]
+    assert [type(record) for record in world.records if not isinstance(record, TickRecord)] == [StartRecord, DoneRecord]
 
 
 def test_every_line_can_be_written_and_says_what_the_task_wanted():
     world = World(steps=5).run()
-    for step, line in enumerate(world.ticks):
-        written = plain(line)
-        assert next(iter(written)) == "tick"
-        np.testing.assert_allclose(bending_angle_deg(line["desired"]), step * np.array([1.0, 2.0, -3.0]))
+    for step, record in enumerate(world.ticks):
+        written = msgspec.json.decode(encode(record))
+        assert next(iter(written.items())) == ("event", "tick")
+        np.testing.assert_allclose(bending_angle_deg(record.desired), step * np.array([1.0, 2.0, -3.0]))
         assert written["board"]["measured_bar"] == [None] * CHANNELS
         assert written["board"]["state"] == "RUNNING"
         assert written["frame"]["age_ms"] == pytest.approx(20.0)
@@ -61,21 +63,21 @@ def test_the_model_gets_the_window_that_training_makes():
     world.run()
     window = Window(3, state_of(REST, "pneumatic"), 1)
     for k, given_features in enumerate(world.features):
-        window.observe(state_of(world.ticks[k]["configuration"], "pneumatic"))
+        window.observe(state_of(world.ticks[k].configuration, "pneumatic"))
         # asked for is the state at the end of the period, which is desired at the start of the next
         due = world.loop.desired[min(k + 1, 5)]
         np.testing.assert_allclose(given_features, window.features(state_of(due, "pneumatic")), atol=1e-12)
-        window.applied(world.ticks[k]["actuation"])
+        window.applied(world.ticks[k].actuation)
 
 
 def test_the_actuation_is_held_to_the_robot_files_step():
     world = World(steps=6)
     world.answer = lambda features: np.array([[2.0], [-2.0], [0.2]])
     world.run()
-    actuation = np.array([line["actuation"] for line in world.ticks])[:, :, 0]
+    actuation = np.array([record.actuation for record in world.ticks])[:, :, 0]
     np.testing.assert_allclose(actuation[:, 0], [0.4, 0.8, 1.0, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(actuation[:, 1], -actuation[:, 0])
-    assert np.array_equal(world.ticks[0]["raw"], [[2.0], [-2.0], [0.2]])
+    assert np.array_equal(world.ticks[0].raw, [[2.0], [-2.0], [0.2]])
 
 
 def test_a_bad_frame_holds_the_command_and_the_state():
@@ -83,7 +85,7 @@ def test_a_bad_frame_holds_the_command_and_the_state():
     world.tracked = False
 
     def see(**changes):
-        return lambda: world.slot.put(world.frame(**changes))
+        return lambda: world.frames.put(world.frame(**changes))
 
     hidden = np.array([True, False, True, True])
     for step in range(8):
@@ -91,19 +93,19 @@ def test_a_bad_frame_holds_the_command_and_the_state():
     answers = iter([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     world.answer = lambda features: np.full((3, 1), next(answers))
     world.run()
-    assert [line["verdict"] for line in world.ticks[2:6]] == ["good", "tool hidden", "tool hidden", "good"]
+    assert [record.frame_status for record in world.ticks[2:6]] == ["good", "tool hidden", "tool hidden", "good"]
     for step in (3, 4):
-        line = world.ticks[step]
-        assert line["raw"] is None
-        assert line["configuration"] is None
-        assert np.array_equal(line["actuation"], world.ticks[2]["actuation"])
+        record = world.ticks[step]
+        assert record.raw is None
+        assert record.configuration is None
+        assert np.array_equal(record.actuation, world.ticks[2].actuation)
         assert np.array_equal(world.sent[step + 1][2], world.sent[3][2])  # sent again, which feeds the board's timer
     # the window of step 5: states of steps 3 (held: step 2), 4 (held), then 5 as slots; T - 1 = 2 measured ones
     states = world.features[3].reshape(3, -1)
     held, now = np.sin(np.radians(2.0)), np.sin(np.radians(5.0))
     assert states[1, 0] == pytest.approx(held)
     assert states[1, 3] == pytest.approx(now)
-    assert world.tally.bad == {"tool hidden": 2}
+    assert world.tick_statistics.bad == {"tool hidden": 2}
 
 
 @pytest.mark.parametrize("phase_s", np.arange(0.0, PERIOD_S, 0.05))
@@ -118,7 +120,7 @@ def test_a_tracker_that_falls_silent_ends_the_run_in_time_whatever_the_phase(pha
     world.frame = lambda **changes: fall_silent() or frame(**changes)
     with pytest.raises(LostInRun, match="no new frame"):
         world.run()
-    assert world.time_s - world.slot.latest().monotonic_s <= 1.2 + 0.05
+    assert world.time_s - world.frames.latest().monotonic_s <= 1.2 + 0.05
 
 
 @pytest.mark.parametrize("phase_s", np.arange(0.0, PERIOD_S, 0.05))
@@ -133,7 +135,7 @@ def test_a_hidden_tool_ends_the_run_at_the_third_tick(phase_s):
     world.frame = lambda **changes: hide() or frame(**changes)
     with pytest.raises(Tripped, match=r"3 ticks in a row.*tool hidden"):
         world.run()
-    first_bad = next(line["tick"] for line in world.ticks if line["verdict"] != "good")
+    first_bad = next(record.tick for record in world.ticks if record.frame_status != "good")
     assert world.time_s == pytest.approx(world.due_s(first_bad + 2))
 
 
@@ -148,14 +150,14 @@ def test_nothing_older_than_a_period_is_ever_used():
 
     world.at = {step: late(age) for step, age in [(4, 0.39), (8, 0.45), (9, 0.02), (14, 2.0), (15, 0.02)]}
     world.run()
-    used = [line["frame"]["age_ms"] for line in world.ticks if line["verdict"] == "good"]
+    used = [record.frame.age_ms for record in world.ticks if record.frame_status == "good"]
     assert max(used) <= 400.0
     assert len(used) < 30
 
 
 def test_a_lost_tracker_ends_the_run_at_once():
     world = World(steps=20)
-    world.at[5] = lambda: setattr(world.slot, "error", OSError("read error"))
+    world.at[5] = lambda: setattr(world.frames, "error", OSError("read error"))
     with pytest.raises(LostInRun, match="read error"):
         world.run()
     assert world.time_s == pytest.approx(world.due_s(5))
@@ -188,23 +190,23 @@ def test_whoever_wanted_to_stop_during_arming_sees_no_valve_open():
 
 
 @pytest.mark.parametrize(
-    ("fault", "error", "verdict", "raw"),
+    ("fault", "error", "status", "raw"),
     [
         (lambda world: world.hide(2), Tripped, "tool hidden", None),
         (lambda world: setattr(world, "answer", lambda features: np.full((3, 1), 50.0)), ModelError, "good", 50.0),
     ],
 )
-def test_the_step_that_ends_a_run_is_in_its_log(fault, error, verdict, raw):
+def test_the_step_that_ends_a_run_is_in_its_log(fault, error, status, raw):
     world = World(steps=20)
     world.at[5] = lambda: fault(world)
     with pytest.raises(error):
         world.run()
-    line = world.ticks[-1]
-    assert line["due_ns"] == pytest.approx((world.time_s - (0.001 if raw else 0.0)) * 1e9, abs=1e6)
-    assert (line["verdict"], line["sent"], line["commanded_bar"]) == (verdict, False, None)
-    assert np.array_equal(line["actuation"], world.ticks[-2]["actuation"])
-    assert line["raw"] is None if raw is None else np.all(line["raw"] == raw)
-    assert len(world.tally.late_ms) == len(world.ticks) - 1  # it is no finished step
+    record = world.ticks[-1]
+    assert record.due_ns == pytest.approx((world.time_s - (0.001 if raw else 0.0)) * 1e9, abs=1e6)
+    assert (record.frame_status, record.sent, record.commanded_bar) == (status, False, None)
+    assert np.array_equal(record.actuation, world.ticks[-2].actuation)
+    assert record.raw is None if raw is None else np.all(record.raw == raw)
+    assert len(world.tick_statistics.late_ms) == len(world.ticks) - 1  # it is no finished step
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -50.0])
@@ -227,14 +229,14 @@ def test_a_step_that_takes_too_long_is_not_sent_and_the_next_is_in_time():
 
     world.answer = slow
     world.run()
-    assert [line["sent"] for line in world.ticks] == [True] * 3 + [False] + [True] * 6
-    assert world.ticks[3]["commanded_bar"] is None
-    assert np.array_equal(world.ticks[3]["actuation"], world.ticks[2]["actuation"])  # what the valves really hold
-    assert world.beats == [4]
-    assert world.tally.missed == 1
+    assert [record.sent for record in world.ticks] == [True] * 3 + [False] + [True] * 6
+    assert world.ticks[3].commanded_bar is None
+    assert np.array_equal(world.ticks[3].actuation, world.ticks[2].actuation)  # what the valves really hold
+    assert world.published_ticks == [4]
+    assert world.tick_statistics.missed == 1
     assert 3 not in [tick - 1 for _, tick, _ in world.sent]
     # the history of the next step knows what was applied, not what was meant
-    assert world.features[4].reshape(3, -1)[0, 8] == world.ticks[2]["actuation"][0, 0]
+    assert world.features[4].reshape(3, -1)[0, 8] == world.ticks[2].actuation[0, 0]
 
 
 def test_missed_ticks_that_are_apart_do_not_add_up():
@@ -242,7 +244,7 @@ def test_missed_ticks_that_are_apart_do_not_add_up():
     for step in (3, 8, 13, 18, 23):
         world.at[step] = lambda: setattr(world, "time_s", world.time_s + 1.3 * PERIOD_S)
     world.run()
-    assert world.tally.missed == 5
+    assert world.tick_statistics.missed == 5
 
 
 def test_skipped_ticks_go_into_the_history_as_held():
@@ -250,10 +252,10 @@ def test_skipped_ticks_go_into_the_history_as_held():
     world.answer = lambda features: np.full((3, 1), 0.05 * len(world.features))
     world.at[4] = lambda: setattr(world, "time_s", world.time_s + 2.3 * PERIOD_S)
     world.run()
-    missed = [line["missed"] for line in world.ticks]
+    missed = [record.missed for record in world.ticks]
     assert sum(missed) == 2
     after = missed.index(2)
-    assert world.ticks[after]["tick"] == world.ticks[after - 1]["tick"] + 3  # the task goes on in real time
+    assert world.ticks[after].tick == world.ticks[after - 1].tick + 3  # the task goes on in real time
     actions = world.features[after].reshape(3, -1)[0, [2, 5, 8]]
     np.testing.assert_allclose(actions, [0.05 * after] * 3)
 
@@ -276,11 +278,11 @@ def test_a_step_that_sent_nothing_has_no_acknowledgement():
 
     world.answer = slow
     world.run()
-    assert [line["sent"] for line in world.ticks] == [True] * 3 + [False] + [True] * 2
-    told = {line["acknowledged"]["tick"]: line["acknowledged"]["ms"] for line in world.lines if "acknowledged" in line}
-    assert told[3] is None
-    assert told[2] == told[4] == pytest.approx(7.0)
-    assert world.tally.acknowledged_ms == pytest.approx([7.0] * 5)
+    assert [record.sent for record in world.ticks] == [True] * 3 + [False] + [True] * 2
+    latency_ms = Run({}, world.ticks, world.records[-1:]).acknowledged_ms
+    assert latency_ms[3] is None
+    assert latency_ms[2] == latency_ms[4] == pytest.approx(7.0)
+    assert world.tick_statistics.acknowledged_ms == pytest.approx([7.0] * 5)
 
 
 def test_the_first_set_point_is_not_older_than_the_start():
@@ -293,8 +295,8 @@ def test_the_first_set_point_is_not_older_than_the_start():
 
     world.set_pressures = slowly
     world.run()
-    [start] = [line for line in world.lines if line.get("event") == "start"]
-    assert start["mono_ns"] * 1e-9 == pytest.approx(world.sent[0][0] - 0.004)
+    [start] = [record for record in world.records if isinstance(record, StartRecord)]
+    assert start.mono_ns * 1e-9 == pytest.approx(world.sent[0][0] - 0.004)
 
 
 def test_acknowledgements_belong_to_the_step_before():
@@ -302,10 +304,10 @@ def test_acknowledgements_belong_to_the_step_before():
     world.at[2] = lambda: setattr(world, "acknowledging", False)
     world.at[4] = lambda: setattr(world, "acknowledging", True)
     world.run()
-    told = [line["acknowledged"] for line in world.lines if "acknowledged" in line]
-    assert [entry["tick"] for entry in told] == [-1, 0, 1, 2, 3, 4, 5]
-    assert [entry["ms"] for entry in told][1:] == pytest.approx(world.tally.acknowledged_ms)
-    assert sum(ms is None for ms in world.tally.acknowledged_ms) == 2
+    told = [record.acknowledged for record in world.records if hasattr(record, "acknowledged")]
+    assert [entry.tick for entry in told] == [-1, 0, 1, 2, 3, 4, 5]
+    assert [entry.ms for entry in told][1:] == pytest.approx(world.tick_statistics.acknowledged_ms)
+    assert sum(ms is None for ms in world.tick_statistics.acknowledged_ms) == 2
 
 
 @settings(max_examples=40, deadline=None)
@@ -316,7 +318,7 @@ def test_set_points_are_never_less_than_half_a_period_apart(stalls, works):
 
     def work(features):
         world.time_s += works[len(world.features) % len(works)]
-        world.slot.put(world.frame())
+        world.frames.put(world.frame())
         return np.full((3, 1), 0.1)
 
     world.answer = work
@@ -344,17 +346,17 @@ def test_a_rehearsal_runs_the_task_without_a_board():
         loop.robot,
         loop.model,
         loop.desired,
-        loop.slot,
-        loop.judge,
+        loop.frames,
+        loop.validator,
         Rehearsal(),
         loop.ticker,
         loop.stop,
         loop.log,
-        loop.tally,
+        loop.statistics,
     ).run(REST)
     assert world.sent == []
     assert len(world.ticks) == 5
-    assert world.ticks[0]["board"] is None
+    assert world.ticks[0].board is None
 
 
 # ---- what is told of it
@@ -365,13 +367,13 @@ def test_summary_and_figures():
     world.at[3] = lambda: world.hide(1)
     world.at[4] = lambda: world.hide()
     world.run()
-    figures = world.tally.figures()
+    figures = world.tick_statistics.figures()
     assert (figures["steps"], figures["missed"], figures["unacknowledged"]) == (10, 0, 0)
-    assert sum(figures["held"].values()) == sum(line["verdict"] != "good" for line in world.ticks) > 0
-    good = [line["tick"] for line in world.ticks if line["verdict"] == "good"]
+    assert sum(figures["held"].values()) == sum(record.frame_status != "good" for record in world.ticks) > 0
+    good = [record.tick for record in world.ticks if record.frame_status == "good"]
     np.testing.assert_allclose(figures["error_deg_mean"], np.mean(good) * np.array([1.0, 2.0, 3.0]))
     assert figures["acknowledged_ms"] == pytest.approx({"p50": 7.0, "p99": 7.0, "max": 7.0})
-    text = "\n".join(world.tally.summary())
+    text = "\n".join(world.tick_statistics.summary())
     assert "10 of 10 control steps" in text
     assert f"module 3: error {3 * np.mean(good):.2f}" in text
     assert "missed ticks: 0" in text
@@ -388,7 +390,7 @@ def test_status_line():
     world.measured_bar = np.full(CHANNELS, np.nan)
     world.measured_bar[:6] = 0.081
     world.run()
-    status = world.tally.status
+    status = world.tick_statistics.status
     assert status.startswith(
         "step 5/5  2.50 Hz  late 0 missed 0  tracker 20 ms 4/4  a +0.10 +0.10 +0.10  bar 0.11|0.08"
     )
@@ -421,18 +423,18 @@ def test_whatever_happens_the_model_sees_what_an_episode_of_training_has(happens
         pass  # three in a row: what came before is looked at
     # as an episode, the period at actuation 0 before step 0 included; the slots that nothing came of are held
     states, actions = [state_of(REST, "pneumatic")], [np.zeros((3, 1))]
-    for line in world.ticks:
-        for _ in range(line["missed"]):
+    for record in world.ticks:
+        for _ in range(record.missed):
             states.append(states[-1])
             actions.append(actions[-1])
-        good = line["configuration"] is not None
-        states.append(state_of(line["configuration"], "pneumatic") if good else states[-1])
-        actions.append(line["actuation"])
+        good = record.configuration is not None
+        states.append(state_of(record.configuration, "pneumatic") if good else states[-1])
+        actions.append(record.actuation)
     rows = episode_features(np.array([*states, states[-1]]), np.array(actions), world.history)
     desired = [name.endswith("[desired]") for name in feature_names("pneumatic", world.history)]
-    asked = [line for line in world.ticks if line["raw"] is not None]
+    asked = [record for record in world.ticks if record.raw is not None]
     assert len(asked) == len(world.features)
-    for line, found in zip(asked, world.features, strict=True):
-        row = rows[line["tick"] + 1]
-        row[:, desired] = state_of(line["aim"], "pneumatic")
+    for record, found in zip(asked, world.features, strict=True):
+        row = rows[record.tick + 1]
+        row[:, desired] = state_of(record.reference, "pneumatic")
         np.testing.assert_allclose(found, row, atol=1e-12)

@@ -54,6 +54,8 @@ WRONG = {
     "fewer tools": line(poses=POSES[1:], valid=[True] * 2, quality=[0.1] * 2),
     "more valid": line(valid=[True] * 4),
     "fewer quality": line(quality=[0.1]),
+    "fewer port status": line(port_status=[49, 49]),
+    "text as port status": line(port_status=["49"] * TOOLS),
     "far away": line(quality=[0.1, 1e7, 0.1]),
     "infinite": line(quality=[1, 1, 1]).replace("[1, 1, 1]", "[1e999, 1, 1]"),
     "NaN": line(quality=[float("nan"), 1, 1]),
@@ -115,6 +117,12 @@ def test_a_log_that_windows_copied(tmp_path, encoding):
     path = tmp_path / "run.jsonl"
     path.write_bytes("\r\n".join([line(1), line(2), ""]).encode(encoding))
     assert numbers(path) == [1, 2]
+
+
+def test_the_port_status_is_replayed(tmp_path):
+    log(tmp_path, line(1, port_status=[49, 49, 113]), line(2))
+    replay = Replay(tmp_path, TOOLS, lambda: 0.0, lambda seconds: None)
+    assert replay.read().port_status == (49, 49, 113)
 
 
 def test_the_command_ends_with_69(tmp_path, model_file):

@@ -101,7 +101,7 @@ def test_pressure_that_stays_after_the_venting_is_said_and_trips(tmp_path, capsy
     assert "\n" not in said
     assert ("tracker lost" in said) == isinstance(error, LostInRun)
     assert (ending.meta["exit_code"], ending.meta["reason"]) == (79, said)
-    assert (ending.end["exit_code"], ending.end["vented"], ending.end["still_bar"]) == (79, True, {"2": 0.213})
+    assert (ending.end["exit_code"], ending.end["vented"], ending.end["residual_bar"]) == (79, True, {"2": 0.213})
 
 
 def test_the_stop_key_vents_at_once(tmp_path, capsys):

@@ -5,13 +5,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from virtual_loop import PERIOD_S, ROBOT, World, spoils
+from virtual_loop import PERIOD_S, ROBOT, World, corrupting
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.clock import SPIN_S
 from modsoft.runtime.control.features import Window
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.log import plain
+from modsoft.runtime.log_record import WarmUpFailedRecord, encode
 from modsoft.runtime.warmup import LEAD, MARGIN, RUNS, WarmUp
 
 RUN_S = 0.0004  # what a run takes
@@ -25,7 +25,7 @@ class Warmed(World):
         self.runs = []
         self.run_s = RUN_S
         self.warm_answer = answer
-        self.warm_up = WarmUp(self.robot, self.rehearse, self.loop.judge, self.log, lambda: self.time_s)
+        self.warm_up = WarmUp(self.robot, self.rehearse, self.loop.validator, self.log, lambda: self.time_s)
         self.loop = dataclasses.replace(self.loop, warm_up=self.warm_up)
 
     def rehearse(self, features):
@@ -40,33 +40,33 @@ def test_it_runs_shortly_before_a_step_and_no_step_is_late():
     before_s = [min(due - at for due in map(world.due_s, range(11)) if due > at) for at in world.runs]
     assert max(before_s) <= LEAD * world.work_s + SPIN_S + 1e-6
     assert min(before_s) >= MARGIN * RUN_S - 1e-6
-    assert max(line["late_ms"] for line in world.ticks) < 1e-3
+    assert max(record.late_ms for record in world.ticks) < 1e-3
 
 
 def test_nothing_that_is_sent_or_logged_differs():
     plainly, warmed = World(steps=8), Warmed(steps=8)
     for world in (plainly, warmed):
-        hidden = spoils(valid=np.array([True, True, False, True]))
-        world.spoilt = [(world.due_s(3) - 0.1, world.due_s(4) - 0.1, hidden)]
+        hidden = corrupting(valid=np.array([True, True, False, True]))
+        world.corrupted = [(world.due_s(3) - 0.1, world.due_s(4) - 0.1, hidden)]
         world.answer = lambda features: features[:, :1] * 2.0 + 0.3
         world.run()
     assert warmed.runs
-    assert [line["verdict"] for line in warmed.ticks] == ["good"] * 3 + ["tool hidden"] + ["good"] * 4
+    assert [record.frame_status for record in warmed.ticks] == ["good"] * 3 + ["tool hidden"] + ["good"] * 4
     np.testing.assert_array_equal([s[2] for s in plainly.sent], [s[2] for s in warmed.sent])
     np.testing.assert_array_equal(plainly.features, warmed.features)
     for one, other in zip(plainly.ticks, warmed.ticks, strict=True):
-        for name in ("verdict", "configuration", "aim", "raw", "actuation", "commanded_bar", "sent", "missed"):
-            assert plain(one[name]) == plain(other[name]), name
+        for name in ("frame_status", "configuration", "reference", "raw", "actuation", "commanded_bar", "sent"):
+            assert encode(getattr(one, name)) == encode(getattr(other, name)), name
 
 
 def test_it_changes_neither_the_judge_nor_the_window():
     world = Warmed()
     window = Window(3, np.array([[0.0, 1.0]] * 3), 1)
-    judge_before, rows_before = copy.deepcopy(vars(world.loop.judge)), window.features(np.zeros((3, 2)))
+    judge_before, rows_before = copy.deepcopy(vars(world.loop.validator)), window.features(np.zeros((3, 2)))
     world.warm_up.step_took(0.001)
     assert world.warm_up.before(0.003, world.frame(angles=(9.0, 9.0, 9.0)), window, np.zeros((3, 1))) == 0.0
     assert len(world.runs) == 1
-    assert repr(judge_before) == repr(vars(world.loop.judge))
+    assert repr(judge_before) == repr(vars(world.loop.validator))
     np.testing.assert_array_equal(window.features(np.zeros((3, 2))), rows_before)
 
 
@@ -109,9 +109,9 @@ def fail():
 @pytest.mark.parametrize("answer", [fail, lambda: np.full((3, 1), np.nan)])
 def test_an_error_in_it_is_logged_once_and_the_run_goes_on(answer):
     world = Warmed(answer=answer, steps=6).run()
-    assert [line["sent"] for line in world.ticks] == [True] * 6
-    [event] = [line for line in world.lines if line.get("event") == "warm-up failed"]
-    assert event["reason"]
+    assert [record.sent for record in world.ticks] == [True] * 6
+    [event] = [record for record in world.records if isinstance(record, WarmUpFailedRecord)]
+    assert event.reason
     assert len(world.runs) == 1
 
 
@@ -123,7 +123,7 @@ def test_an_error_that_persists_ends_the_run_as_without_it():
         with pytest.raises(ModelError) as raised:
             world.run()
         last = world.ticks[-1]
-        ends.append((str(raised.value), last["tick"], last["sent"], len(world.sent)))
+        ends.append((str(raised.value), last.tick, last.sent, len(world.sent)))
     assert ends[0] == ends[1]
 
 
@@ -132,4 +132,4 @@ def test_a_run_that_takes_long_is_not_repeated():
     world.run_s = 0.003
     world.run()
     assert len(world.runs) == 3  # one before each step but the first, and one before the end
-    assert max(line["late_ms"] for line in world.ticks) < 1e-3
+    assert max(record.late_ms for record in world.ticks) < 1e-3

@@ -16,7 +16,7 @@ from virtual_loop import planar_poses
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child
-from modsoft.runtime import log as logs
+from modsoft.runtime.log_reader import Follower, read
 
 SCRIPT = Path(sys.executable).with_name("modsoft-runtime")
 FAULTY = (sys.executable, str(Path(__file__).with_name("faulty_runtime.py")))
@@ -100,6 +100,7 @@ class Run:
         """`terminal`: a file descriptor of what is to be its terminal, where it then says what it has to say."""
         self.stand, self.runs = stand, folder / "runs"
         self.began = len(stand.board.trace)
+        self._follower = None
         command = [*program, *stand.options(), "--model", str(model), "--task", str(task), *options]
         if terminal is not None:
             command = [sys.executable, "-c", OWN_TERMINAL, *command]
@@ -144,15 +145,20 @@ class Run:
                 raise AssertionError(self.said) if self.armed() else NeverBegan(self.said)
             time.sleep(0.02)
 
-    def log_text(self):
-        return "".join(path.read_text() for path in self.runs.glob("*/run.jsonl"))
+    def last_tick(self):
+        """The newest tick of the log; None before the first."""
+        if self._follower is None:
+            [path] = self.runs.glob("*/run.jsonl")
+            self._follower = Follower(path)
+        self._follower.new()
+        return self._follower.last
 
     def armed(self):
         """Whether the log is open, which is just before arming."""
         return any(self.runs.glob("*/run.jsonl"))
 
     def ticks(self):
-        return self.log_text().count('\n{"tick"')
+        return self._follower.count if self.armed() and self.last_tick() else 0
 
     def left(self):
         """The exit code and when the process was seen to be gone, CLOCK_MONOTONIC ns; the stand then knows all that the
@@ -166,7 +172,7 @@ class Run:
 
     def log(self):
         [folder] = self.runs.iterdir()
-        return logs.read(folder)
+        return read(folder)
 
     def closed_ns(self):
         """CLOCK_MONOTONIC (ns) at which the board closed the last valve, 0 where none was open; infinite while one

@@ -39,7 +39,7 @@ class SteppedRun:
         self.clock = self.port.clock
         self.board = Board(self.port, "the emulated MEGA", self.clock, threaded=False)
         self._pump, self.board._line.pump = self.board._line.pump, self.pump
-        self.slot, self.stop, self.tally = LatestFrame(), Stop(), TickStatistics(ROBOT, STEPS)
+        self.frames, self.stop, self.statistics = LatestFrame(), Stop(), TickStatistics(ROBOT, STEPS)
         self.stop.wait = self.wait
         self.log = RunLog(folder, ROBOT.name, "", {})
         self.cause_s += self.clock()
@@ -47,10 +47,10 @@ class SteppedRun:
     def pump(self):
         """A turn of the port's thread; lets time pass."""
         going_on = self._pump()
-        if self.slot.error is None:
+        if self.frames.error is None:
             at_s = self.clock()
             frame = TrackerFrame(int(at_s * 60), at_s, planar_poses((1.0, 2.0, 3.0)), np.ones(4, bool), np.full(4, 0.1))
-            self.slot.put(frame)
+            self.frames.put(frame)
         if self.cause is not None and self.clock() >= self.cause_s:
             cause, self.cause, self.caused_s = self.cause, None, self.clock()
             cause(self)
@@ -78,16 +78,25 @@ class SteppedRun:
                 signals.hold()
                 try:
                     self.board.arm(ROBOT)
-                    judge = FrameValidator(ROBOT)
-                    rest = session._rest(self.slot, judge, self.stop, self.clock, LostInRun)
+                    validator = FrameValidator(ROBOT)
+                    rest = session._rest(self.frames, validator, self.stop, self.clock, LostInRun)
                     ticker = Ticker(PERIOD_S, self.clock, self.wait)
                     Loop(
-                        ROBOT, self, desired, self.slot, judge, self.board, ticker, self.stop, self.log.put, self.tally
+                        ROBOT,
+                        self,
+                        desired,
+                        self.frames,
+                        validator,
+                        self.board,
+                        ticker,
+                        self.stop,
+                        self.log.put,
+                        self.statistics,
                     ).run(rest)
                 except BaseException as raised:  # noqa: BLE001 - as in the session itself
                     error = raised
                 with contextlib.closing(self.board):
-                    session.finish(self.board, self.log, self.tally, self.slot, error)
+                    session.finish(self.board, self.log, self.statistics, self.frames, error)
         except BaseException as raised:  # noqa: BLE001 - looked at by the test
             self.error = raised
         finally:

@@ -1,4 +1,4 @@
-"""The loop on virtual time: a tracker, a model and a board that do what the test tells them."""
+"""The loop on virtual time: a tracker, a model and a board that the test controls."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from modsoft.runtime import robot as robots
 from modsoft.runtime.board.protocol import CHANNELS, State
 from modsoft.runtime.clock import Ticker
 from modsoft.runtime.control.features import from_angles_deg
+from modsoft.runtime.log_record import Record, TickRecord
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.safety import FrameValidator
 from modsoft.runtime.statistics import TickStatistics
@@ -32,7 +33,7 @@ def planar_poses(angles_deg, module_mm=MODULE_MM):
     return _planar_poses(tuple(angles_deg), module_mm).copy()
 
 
-@functools.lru_cache(maxsize=1)  # most robots here hang where they hung before
+@functools.lru_cache(maxsize=1)  # most robots here hang still
 def _planar_poses(angles_deg, module_mm):
     poses = [np.eye(4)]
     total, position = 0.0, np.zeros(3)
@@ -54,27 +55,27 @@ def _planar_poses(angles_deg, module_mm):
 class World:
     """Virtual time with a robot that hangs still, a tracker of 60 Hz, a board and a model.
 
-    `at[step]` is called when that step's turn has come, before the loop looks at anything. `dark` and `spoilt` are
-    faults of the tracker over time, exact whenever the loop looks: nothing is seen in [from, to) of a `dark` pair, and
-    a frame of [from, to) of a `spoilt` triple is what its function makes of it.
+    `at[step]` is called when that step is due, before the loop reads anything. `dark` and `corrupted` are faults of the
+    tracker over time, exact at any time of reading: the tracker sees nothing in [from, to) of a `dark` pair, and the
+    function of a `corrupted` triple changes the frames of [from, to).
     """
 
     def __init__(self, steps=10, robot=ROBOT):
         self.robot = robot
         self.time_s = START_S
         self.frame_age_s = 0.02
-        self.angles = (0.0, 0.0, 0.0)  # where the robot hangs, degrees
+        self.angles = (0.0, 0.0, 0.0)  # of the robot, degrees
         self.hidden = ()
         self.dark: list[tuple[float, float]] = []
-        self.spoilt: list[tuple[float, float, Callable[[TrackerFrame], TrackerFrame]]] = []
-        self.slot = LatestFrame()
-        self.slot.put(self.frame())
-        self.lines: list[dict[str, Any]] = []
+        self.corrupted: list[tuple[float, float, Callable[[TrackerFrame], TrackerFrame]]] = []
+        self.frames = LatestFrame()
+        self.frames.put(self.frame())
+        self.records: list[Record] = []
         self.stop = Stop()
         self.at: dict[int, Callable[[], Any]] = {}
         self.tracked = True
         self.sent: list[tuple[float, int, np.ndarray]] = []  # (time, wire tick, pressures)
-        self.beats: list[int] = []
+        self.published_ticks: list[int] = []
         self.features: list[np.ndarray] = []
         self.answer = lambda features: np.full((robot.modules, 1), 0.1)
         self.work_s = 0.001
@@ -90,23 +91,23 @@ class World:
         # the model
         self.history = 3
         desired = from_angles_deg(np.outer(np.arange(steps), [1.0, 2.0, -3.0][: robot.modules]))
-        self.tally = TickStatistics(robot, steps)
+        self.tick_statistics = TickStatistics(robot, steps)
         self.loop = Loop(
             robot,
             self,
             desired,
-            self.slot,
+            self.frames,
             FrameValidator(robot),
             self,
             Ticker(PERIOD_S, lambda: self.time_s, self.wait),
             self.stop,
-            lambda line: self.log(line),
-            self.tally,
+            lambda record: self.log(record),
+            self.tick_statistics,
         )
 
     def frame(self, angles=None, **changes):
         at_s = self.time_s - self.frame_age_s
-        for from_s, to_s in reversed(self.dark):  # the newest of them first, since one may follow upon another
+        for from_s, to_s in reversed(self.dark):  # the newest first: one may follow directly after another
             if from_s <= at_s < to_s:
                 at_s = np.nextafter(from_s, 0.0)
         count = self.robot.modules + 1
@@ -115,13 +116,13 @@ class World:
         poses = planar_poses((angles or self.angles)[: count - 1])
         parts = {"poses": poses, "valid": valid, "quality": np.full(count, 0.1)}
         frame = TrackerFrame(int(at_s * 60), at_s, **(parts | changes))
-        for from_s, to_s, spoil in self.spoilt:
+        for from_s, to_s, corrupt in self.corrupted:
             if from_s <= at_s < to_s:
-                frame = spoil(frame)
+                frame = corrupt(frame)
         return frame
 
     def hide(self, *tools):
-        """These are not seen from now on."""
+        """Hides these tools from now on."""
         self.hidden = tools
 
     def due_s(self, step):
@@ -132,10 +133,10 @@ class World:
         for step in [step for step in self.at if self.time_s >= self.due_s(step) - 1e-6]:
             self.at.pop(step)()
         if self.tracked:
-            self.slot.put(self.frame())
+            self.frames.put(self.frame())
 
-    def log(self, line):
-        self.lines.append(line)
+    def log(self, record):
+        self.records.append(record)
 
     # the board
 
@@ -153,7 +154,7 @@ class World:
         return sequence
 
     def publish_tick(self, tick):
-        self.beats.append(tick)
+        self.published_ticks.append(tick)
 
     # the model
 
@@ -170,9 +171,9 @@ class World:
 
     @property
     def ticks(self):
-        return [line for line in self.lines if "tick" in line]
+        return [record for record in self.records if isinstance(record, TickRecord)]
 
 
-def spoils(**changes):
-    """For `World.spoilt`: a frame with these parts replaced."""
+def corrupting(**changes):
+    """For `World.corrupted`: a frame with these parts replaced."""
     return lambda frame: dataclasses.replace(frame, **changes)

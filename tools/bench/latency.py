@@ -46,6 +46,7 @@ from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.ort import onnxruntime
 from modsoft.runtime.entry_point import entry
+from modsoft.runtime.log_record import Record, TickRecord
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameValidator
@@ -177,9 +178,10 @@ def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict
                 tracker.send({"poses": swinging(modules, time.monotonic() - began_s)})
                 stop.wait(min(seconds, 0.02))
 
-            def log(line: dict[str, Any]) -> None:
-                if line.get("sent") and line["verdict"] == "good":
-                    lines.append({**stamps, "number": line["frame"]["number"]})
+            def log(record: Record) -> None:
+                if isinstance(record, TickRecord) and record.sent and record.frame_status == "good":
+                    assert record.frame is not None
+                    lines.append({**stamps, "number": record.frame.number})
 
             judge = FrameValidator(robot)
             desired = np.repeat(from_angles_deg(np.zeros((1, modules))), count, axis=0)

@@ -13,10 +13,11 @@ import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Protocol
 
-import msgspec
+from modsoft.runtime.clock import LATE_MS
+from modsoft.runtime.log_reader import Follower
+from modsoft.runtime.log_record import TickRecord
 
 Line = dict[str, Any]
 
@@ -40,25 +41,6 @@ class Tracker(Protocol):
     def send(self, line: Line) -> None: ...
 
 
-class Log:
-    """The tick lines of a run log, read as it grows."""
-
-    def __init__(self, path: Path):
-        self._file = path.open("rb")
-        self._rest = b""
-        self.last: Line = {}
-
-    def new(self) -> list[Line]:
-        """The ticks that have come since it was asked last."""
-        *whole, self._rest = (self._rest + self._file.read()).split(b"\n")
-        found = [line for line in map(msgspec.json.decode, whole) if "tick" in line]
-        self.last = found[-1] if found else self.last
-        return found
-
-    def close(self) -> None:
-        self._file.close()
-
-
 @dataclass
 class Scene:
     """What a fault acts on: a run in its middle. `sensed`: pressures, bar, that the board's sensors of these channels
@@ -67,14 +49,15 @@ class Scene:
     board: Board
     tracker: Tracker
     process: subprocess.Popen[bytes]
-    log: Log
+    log: Follower
     period_s: float
     sensed: dict[int, float] = field(default_factory=dict)
 
     def before_tick(self, seconds: float) -> None:
         """Waits until so long before the next tick is due."""
         self.log.new()
-        due_s = self.log.last["due_ns"] * 1e-9
+        assert self.log.last is not None, "the run has begun"
+        due_s = self.log.last.due_ns * 1e-9
         while due_s - seconds < time.monotonic() + 0.02:
             due_s += self.period_s
         time.sleep(due_s - seconds - time.monotonic())
@@ -91,7 +74,7 @@ class Fault:
     """row: of the failure matrix. begin, undo: what is done and what ends it, `lasts_s` later (None: as soon as it was
     noticed, in a line of the log or by the end of the run).
 
-    sign(line, before): whether a tick's line says that it was noticed; `before` is the last line before the fault.
+    sign(tick, before): whether a tick of the log shows the fault; `before` is the last tick before the fault.
     None: it must end the run. codes: the exit codes that it may end the run with; none: the run must go on. says: what
     the run's last words must match then. vents_ms: the board alone has every valve at 0 so long after `begin`, emulated
     time; None: the runtime vents, judged from when it said so.
@@ -102,7 +85,7 @@ class Fault:
     begin: Act
     undo: Act | None = None
     lasts_s: float | None = None
-    sign: Callable[[Line, Line], bool] | None = None
+    sign: Callable[[TickRecord, TickRecord], bool] | None = None
     codes: tuple[int, ...] = ()
     says: str = ""
     vents_ms: float | None = None
@@ -111,9 +94,9 @@ class Fault:
     def goes_by(self) -> bool:
         return self.sign is not None
 
-    def noticed(self, lines: list[Line], before: Line) -> Line | None:
-        """The first line that says so."""
-        return next((line for line in lines if self.sign is not None and self.sign(line, before)), None)
+    def noticed(self, ticks: list[TickRecord], before: TickRecord) -> TickRecord | None:
+        """The first tick that shows the fault."""
+        return next((tick for tick in ticks if self.sign is not None and self.sign(tick, before)), None)
 
     def ended_well(self, code: int, words: str) -> bool:
         """Whether a run that the fault ended said the right thing."""
@@ -164,23 +147,23 @@ def garbage_at_a_tick(scene: Scene) -> None:
     scene.board.send(f"flood {GARBAGE_MS}")
 
 
-def held(*words: str) -> Callable[[Line, Line], bool]:
+def held(*words: str) -> Callable[[TickRecord, TickRecord], bool]:
     """A tick without a good frame, for one of these reasons."""
-    return lambda line, before: line["verdict"] in words
+    return lambda tick, before: tick.frame_status in words
 
 
-def counted(*names: str) -> Callable[[Line, Line], bool]:
+def counted(*names: str) -> Callable[[TickRecord, TickRecord], bool]:
     """One of the link's counts has grown."""
-    return lambda line, before: any(line["link"][name] > before["link"][name] for name in names)
+    return lambda tick, before: any(tick.connection[name] > before.connection[name] for name in names)
 
 
-def late(line: Line, before: Line) -> bool:
-    return bool(line["late_ms"] > 20.0)
+def late(tick: TickRecord, before: TickRecord) -> bool:
+    return tick.late_ms > LATE_MS
 
 
-def acknowledged_late(line: Line, before: Line) -> bool:
-    """The set-points before this tick: the line was taken."""
-    return bool((line["acknowledged"]["ms"] or math.inf) > 20.0)
+def acknowledged_late(tick: TickRecord, before: TickRecord) -> bool:
+    """The set-points before this tick: the serial line was busy."""
+    return (tick.acknowledged.ms or math.inf) > LATE_MS
 
 
 ON_ITS_OWN_MS = 700.0  # cable pulled: the link's time-out and the ramp from the highest pressure

@@ -10,8 +10,8 @@ import numpy as np
 from modsoft.hil import outputs, record, valves
 from modsoft.hil.criteria import DESIRED_ERROR, VALVE_COUNTS, desired_error
 from modsoft.hil.faults import ON_ITS_OWN_MS, Fault
-from modsoft.runtime import log as logs
 from modsoft.runtime.errors import LostInRun
+from modsoft.runtime.log_reader import Run
 
 Line = dict[str, Any]
 
@@ -49,16 +49,16 @@ class Ran:
     wrong: list[str] = field(default_factory=list)
 
 
-def judge_log(ran: Ran, read: logs.Run, said: str) -> None:
+def judge_log(ran: Ran, read: Run, said: str) -> None:
     """A log that a person can follow: whole lines in order, the cause, the exit code."""
-    numbers = [tick["tick"] for tick in read.ticks]
+    numbers = [tick.tick for tick in read.ticks]
     if numbers != sorted(set(numbers)):
         ran.wrong.append("ticks of the log out of order")
     if ran.code < 0:
         return  # killed: the log ends where it was
     if read.meta["exit_code"] != ran.code:
         ran.wrong.append(f"the log says exit code {read.meta['exit_code']}")
-    if read.events[-1]["event"] != "end":
+    if read.end is None:
         ran.wrong.append("the log has no end")
     if read.meta["lines_lost"]:
         ran.wrong.append(f"{read.meta['lines_lost']} lines of the log lost")

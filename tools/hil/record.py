@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from modsoft.hil.board.emulator import FIRMWARE, FIRMWARE_ELF
 from modsoft.hil.outputs import ValveOutputs, emulated_us, read_outputs
-from modsoft.runtime import log
+from modsoft.runtime import log_reader
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS, to_bar
+from modsoft.runtime.log_record import TickRecord
 from modsoft.runtime.robot import Robot
 
 Line = dict[str, Any]
@@ -75,16 +76,11 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, asked: np.ndar
     """
     events = lines(folder / "board.jsonl")
     plant = lines(folder / "plant.jsonl")
-    ticks: list[Line] = []
-    told: list[Line] = []
-    meta: Line = {}
-    if run is not None:
-        meta, ticks, told = log.read(run)
-    start = next((event for event in told if event["event"] == "start"), None)
-    start_bar = start["commanded_bar"] if start else [0.0] * CHANNELS
-    end = next((event for event in told if event["event"] == "end"), None)
-    start_ns = ticks[0]["mono_ns"] if ticks else math.inf
-    end_ns = end["mono_ns"] if end else ticks[-1]["mono_ns"] if ticks else -1
+    log = log_reader.Run({}, [], []) if run is None else log_reader.read(run)
+    ticks, start, end, acknowledged_ms = log.ticks, log.start, log.end, log.acknowledged_ms
+    start_bar = start.commanded_bar if start else np.zeros(CHANNELS)
+    start_ns = ticks[0].mono_ns if ticks else math.inf
+    end_ns = end.mono_ns if end else ticks[-1].mono_ns if ticks else -1
     summary = next((event for event in events if event["event"] == "summary"), {})
     count, modules = len(ticks), robot.modules
     said = (folder / "runtime.err").read_text(errors="replace").strip().splitlines()
@@ -94,26 +90,26 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, asked: np.ndar
         asked=asked,
         runtime_exit=runtime_exit,
         runtime_said=said[-1] if said else "",
-        tick=_column(ticks, "tick", np.int64),
-        mono_ns=_column(ticks, "mono_ns", np.int64),
-        lateness_ms=_column(ticks, "late_ms"),
-        missed=sum(tick["missed"] + (not tick["sent"]) for tick in ticks),
-        held=sum(tick["verdict"] != "good" for tick in ticks),
-        desired=_column(ticks, "desired").reshape(count, modules, 3),
+        tick=np.array([tick.tick for tick in ticks], dtype=np.int64),
+        mono_ns=np.array([tick.mono_ns for tick in ticks], dtype=np.int64),
+        lateness_ms=np.array([tick.late_ms for tick in ticks]),
+        missed=sum(tick.missed + (not tick.sent) for tick in ticks),
+        held=sum(tick.frame_status != "good" for tick in ticks),
+        desired=np.array([tick.desired for tick in ticks]).reshape(count, modules, 3),
         configuration=np.array(
-            [tick["configuration"] or np.full((modules, 3), np.nan) for tick in ticks], dtype=np.float64
+            [np.full((modules, 3), np.nan) if tick.configuration is None else tick.configuration for tick in ticks]
         ).reshape(count, modules, 3),
-        frame_mono_ns=np.array([tick["frame"]["mono_ns"] if tick["frame"] else -1 for tick in ticks], dtype=np.int64),
-        start_ns=start["mono_ns"] if start else None,
-        start_bar=np.array(start_bar),
+        frame_mono_ns=np.array([tick.frame.mono_ns if tick.frame else -1 for tick in ticks], dtype=np.int64),
+        start_ns=start.mono_ns if start else None,
+        start_bar=start_bar,
         commanded_bar=_commanded(ticks, start_bar),
-        slew_bar_per_s=_slew_bar_per_s(robot, meta),
-        acknowledged_ms=np.array([_number(tick["acknowledged"]["ms"]) for tick in ticks]),
-        faults=np.array([tick["board"]["faults"] if tick["board"] else 0 for tick in ticks], dtype=np.int64),
-        state=[tick["board"]["state"] if tick["board"] else "unknown" for tick in ticks],
+        slew_bar_per_s=_slew_bar_per_s(robot, log.meta),
+        acknowledged_ms=np.array([_number(acknowledged_ms.get(tick.tick)) for tick in ticks]),
+        faults=np.array([tick.board.faults if tick.board else 0 for tick in ticks], dtype=np.int64),
+        state=[tick.board.state if tick.board else "unknown" for tick in ticks],
         end_ns=end_ns,
         end_us=emulated_us(events, end_ns),
-        said_vented=bool(end and end["vented"]),
+        said_vented=bool(end and end.vented),
         outputs=read_outputs(events),
         board_events=[event for event in events if event["event"] in ("reset", "watchdog")],
         board_dropped_bytes=summary.get("rx_overrun", math.nan),
@@ -123,20 +119,20 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, asked: np.ndar
     )
 
 
-def _column(ticks: list[Line], name: str, kind: Any = np.float64) -> np.ndarray:
-    return np.array([tick[name] for tick in ticks], dtype=kind)
+def _column(states: list[Line], name: str, kind: Any = np.float64) -> np.ndarray:
+    return np.array([state[name] for state in states], dtype=kind)
 
 
 def _number(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def _commanded(ticks: list[Line], start_bar: list[float]) -> np.ndarray:
+def _commanded(ticks: list[TickRecord], start_bar: Array) -> Array:
     """Set-points (K, channels) in force after each tick: those before it where nothing was sent."""
     rows = [start_bar]
     for tick in ticks:
-        rows.append(tick["commanded_bar"] or rows[-1])
-    return np.array(rows[1:], dtype=np.float64).reshape(len(ticks), len(start_bar))
+        rows.append(rows[-1] if tick.commanded_bar is None else tick.commanded_bar)
+    return np.array(rows[1:]).reshape(len(ticks), len(start_bar))
 
 
 def _slew_bar_per_s(robot: Robot, meta: Line) -> float:

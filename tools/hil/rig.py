@@ -28,6 +28,7 @@ from modsoft.hil.plant import load_robot
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.report_folder import LOG_PREFIX
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, UsageError
+from modsoft.runtime.log_reader import Follower
 
 Line = dict[str, Any]
 
@@ -114,6 +115,7 @@ class Rig:
         self._robot_file = str(Path(robot_file).resolve() if Path(robot_file).is_file() else robot_file)
         self.folder = folder
         self.runs: Path | None = None  # where the latest runtime logs
+        self._follower: Follower | None = None  # of that log
         self.board = EmulatedBoard(board, on_event=self._board_event)
         self.plant: Child
         self.tracker: Child
@@ -231,7 +233,12 @@ class Rig:
     def ticks(self) -> int:
         """Ticks in the run log so far."""
         folder = self.run_folder()
-        return (folder / "run.jsonl").read_bytes().count(b'\n{"tick"') if folder else 0
+        if folder is None:
+            return 0
+        if self._follower is None or self._follower.path.parent != folder:
+            self._follower = Follower(folder / "run.jsonl")
+        self._follower.new()
+        return self._follower.count
 
     def said(self) -> str:
         """The runtime's last line on standard error."""

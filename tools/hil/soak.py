@@ -8,17 +8,17 @@ import random
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from modsoft.hil import post_fault_checks, record
-from modsoft.hil.faults import FAULTS, NOTICED_WITHIN_S, Fault, Log, Scene
+from modsoft.hil.faults import FAULTS, NOTICED_WITHIN_S, Fault, Scene
 from modsoft.hil.post_fault_checks import Injected, Ran
 from modsoft.hil.rig import Rig
-from modsoft.runtime import log as logs
+from modsoft.runtime import log_reader
 from modsoft.runtime.control.tasks import load_task
 
 Line = dict[str, Any]
@@ -79,12 +79,12 @@ class Soak:
         board_began, plant_began, began_s = len(rig.board.trace), len(rig.plant_states), time.monotonic()
         process = rig.run(self.model, str(self._task), runs=self.folder / f"run-{ran.number:03}")
         injected: list[Injected] = []
-        with self._log(process) as log:
-            while log is not None and process.poll() is None and time.monotonic() < self._end_s:
-                scene = Scene(rig.board, rig.tracker, process, log, rig.robot.loop.period_s, rig.sensed)
-                self._watch(ran, process, began_s, self._random.uniform(*self._pause_s))
-                if process.poll() is None and time.monotonic() < self._end_s:
-                    injected.append(self._inject(self._draw(), scene, ran))
+        log = self._log(process)
+        while log is not None and process.poll() is None and time.monotonic() < self._end_s:
+            scene = Scene(rig.board, rig.tracker, process, log, rig.robot.loop.period_s, rig.sensed)
+            self._watch(ran, process, began_s, self._random.uniform(*self._pause_s))
+            if process.poll() is None and time.monotonic() < self._end_s:
+                injected.append(self._inject(self._draw(), scene, ran))
         by_itself = process.poll() is not None
         if not by_itself:
             process.send_signal(signal.SIGINT)
@@ -100,21 +100,15 @@ class Soak:
         self._judge(ran, injected, by_itself, board_began, plant_began)
         return injected
 
-    @contextlib.contextmanager
-    def _log(self, process: subprocess.Popen[bytes]) -> Iterator[Log | None]:
+    def _log(self, process: subprocess.Popen[bytes]) -> log_reader.Follower | None:
         """The log of a run that has begun; None where it does not."""
         until_s = time.monotonic() + START_S
         while self.rig.ticks() < FIRST_TICKS and process.poll() is None and time.monotonic() < until_s:
             time.sleep(LOOK_S)
         found = self.rig.run_folder()
         if found is None or self.rig.ticks() < FIRST_TICKS:
-            yield None
-            return
-        log = Log(found / "run.jsonl")
-        try:
-            yield log
-        finally:
-            log.close()
+            return None
+        return log_reader.Follower(found / "run.jsonl")
 
     def _watch(self, ran: Ran, process: subprocess.Popen[bytes], began_s: float, seconds: float) -> None:
         """Nothing is done for so long, but memory is looked at."""
@@ -141,13 +135,14 @@ class Soak:
         """Does a fault, waits until it is noticed or the run has ended, and undoes it."""
         scene.log.new()
         before = scene.log.last
+        assert before is not None, "the run has begun"
         found = Injected(fault, ran.number, time.monotonic() - self._start_s, time.monotonic_ns())
         fault.begin(scene)
         began_s, undone = time.monotonic(), fault.undo is None
         while scene.process.poll() is None and time.monotonic() - began_s < NOTICED_WITHIN_S:
-            line = fault.noticed(scene.log.new(), before)
-            if line is not None and found.noticed_ms is None:
-                found.noticed_ms = (line["mono_ns"] - found.mono_ns) * 1e-6
+            tick = fault.noticed(scene.log.new(), before)
+            if tick is not None and found.noticed_ms is None:
+                found.noticed_ms = (tick.mono_ns - found.mono_ns) * 1e-6
             known = found.noticed_ms is not None
             over = known if fault.lasts_s is None else time.monotonic() - began_s >= fault.lasts_s
             if fault.undo and not undone and over:
@@ -179,7 +174,7 @@ class Soak:
         if run is None:
             ran.wrong.append(f"the run never began: {rig.said()}")
             return
-        read = logs.read(run)
+        read = log_reader.read(run)
         ran.ticks = len(read.ticks)
         post_fault_checks.judge_log(ran, read, said)
         for each in injected:
