@@ -1,6 +1,6 @@
-"""Small trained-looking models for every part that needs one. The numbers are random; the formats are real.
+"""Small models with random weights in the real formats, and checks around every test.
 
-What tests of several parts share stands in tests/shared, importable by its file's name.
+Modules that several tests use are in tests/shared, importable by their file's name.
 """
 
 import importlib.util
@@ -12,13 +12,13 @@ import host_load
 import pytest
 from hypothesis import settings
 
-# A busy machine is no defect: what is judged against the wall clock says so with a marker.
+# No time limits: tests against the wall clock have the marker `realtime`.
 settings.register_profile("modsoft", deadline=None)
 settings.load_profile("modsoft")
 
 
 def pytest_configure():
-    """A copied checkout whose .venv still belongs to the original would test the original."""
+    """Refuses a copied checkout whose .venv still belongs to the original: it would test the original."""
     if (spec := importlib.util.find_spec("modsoft.runtime.errors")) is None or spec.origin is None:
         raise pytest.UsageError(f"{sys.executable} has no modsoft: make install")
     installed, here = Path(spec.origin).resolve().parents[1], Path(__file__).resolve().parents[1]
@@ -45,12 +45,12 @@ def _measured_host(request):
 def pytest_runtest_makereport(item, call):
     report = yield
     load = getattr(item, "host_load", None)
-    return host_load.judged(report, load.worst_s()) if load and call.when == "call" else report
+    return host_load.excused(report, load.worst_s()) if load and call.when == "call" else report
 
 
 @pytest.fixture(autouse=True)
 def child_imports():
-    """A command that a test runs in this process changes how child processes import; not those of later tests."""
+    """Restores how child processes import, which a command that a test runs in this process changes."""
     before = os.environ.get("PYTHONSAFEPATH")
     yield
     if before is None:
@@ -98,14 +98,14 @@ def make_checkpoint():
 
 @pytest.fixture(scope="session")
 def exported(tmp_path_factory, make_checkpoint):
-    """exported(name, **how) gives the model of make_checkpoint(**how). Models of the folder MODSOFT_TEST_MODELS are
-    taken from there, and made there where they are missing: a Python without torch tests with those of another."""
+    """exported(name, **settings) returns the model of make_checkpoint(**settings). With MODSOFT_TEST_MODELS, models are
+    kept in that folder: a Python without torch uses those of another Python."""
     folder = os.environ.get("MODSOFT_TEST_MODELS")
 
-    def export_once(name, **how):
+    def export_once(name, **settings):
         path = Path(folder, f"{name}.onnx") if folder else tmp_path_factory.mktemp(name) / f"{name}.onnx"
         if not path.exists():
-            checkpoint = make_checkpoint(path.with_suffix(".pt"), **how)
+            checkpoint = make_checkpoint(path.with_suffix(".pt"), **settings)
             from modsoft.export.write import export
 
             export(checkpoint, path)
@@ -116,11 +116,11 @@ def exported(tmp_path_factory, make_checkpoint):
 
 @pytest.fixture(scope="session")
 def model_file(exported):
-    """A small model.onnx for pneumatic robots, history 3, exported and checked as any other. Not to be changed."""
+    """A small model.onnx for pneumatic robots, history 3, exported and checked as any other. Read only."""
     return exported("model")
 
 
 @pytest.fixture(scope="session")
 def strong_model(exported):
-    """A model whose answers reach the end of the range: module 1 at full pressure. Not to be changed."""
+    """A model whose actuation reaches its limits: module 1 at full pressure. Read only."""
     return exported("strong", gain=4.0)

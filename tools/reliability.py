@@ -1,7 +1,7 @@
 """The failure matrix: runs its tests and writes docs/reliability.md from the lines that they print.
 
-`make reliability` runs tests/reliability with the smaller numbers of tries, `tools/reliability.py --full` with those of
-the matrix. Exit code 1 where a row is missing or not met.
+`make reliability` runs tests/reliability with few tries, `tools/reliability.py --full` with the numbers of the matrix.
+Exit code 1 if a row is missing or not met.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FIELDS = ("row", "fault", "tries", "limit", "worst", "clock", "met", "why", "tes
 
 
 class Row(NamedTuple):
-    """A row of the matrix: what happens, what has to follow, and when that counts as shown."""
+    """A row of the matrix: the fault, the required reaction, and the limit at which the row is met."""
 
     fault: str
     required: str
@@ -61,25 +61,25 @@ ROWS: dict[int, Row] = {
     6: Row("cable pulled", "board vents, host stops cleanly", "vented in 700 ms; host notices in 150 ms"),
     7: Row(
         "plugged in again under another name",
-        "found by its USB identity, HELLO, new ARM, never by itself to RUNNING",
+        "found by its USB identity, HELLO, new ARM; RUNNING only after a new ARM",
         "IDLE in 8 s; 20 of 20",
     ),
     8: Row(
         "board reset in mid-run",
-        "host sees the boot id change, goes silent, sends no stale set-point",
+        "host detects the new boot id, stops sending, sends no stale set-point",
         "noticed in 1.2 s, outputs 0 in 130 ms, back in 6 s; 50 of 50",
     ),
-    9: Row("host would talk to the bootloader", "silent until HELLO", "0 bytes in 100 opens"),
+    9: Row("host could send to the bootloader", "silent until HELLO", "0 bytes in 100 opens"),
     10: Row("host SIGKILLed", "board vents", "all 0 in 670 ms from 0.35 bar"),
     11: Row(
-        "host SIGSTOPped; control thread stuck while I/O lives",
+        "host SIGSTOPped; control thread stuck while the I/O thread runs",
         "vent by link timer; by control timer",
         "670 ms; 1.4 s; on return the fault is latched",
     ),
     12: Row(
         "Ctrl-C, SIGTERM, SIGHUP, exception",
-        "VENT, wait for the board's word, exit code",
-        '100 of 100 at random phases; "vented" is only said after the board said so',
+        "VENT, wait for the board's confirmation, exit code",
+        '100 of 100 at random phases; "vented" is reported only after the board confirms it',
     ),
     13: Row(
         "tracker off, intermittent",
@@ -90,7 +90,7 @@ ROWS: dict[int, Row] = {
         "tracker frozen (same frame again)", "detected", "within 3 ticks; no false alarm in 1 h of simulated noise"
     ),
     15: Row("stale, delayed frames", "never used", "0 older than one period used"),
-    16: Row("NaN (a missing tool is NaN in NDI's client)", "rejected, never reaches the model", "0 in 10^4"),
+    16: Row("NaN (a missing tool is NaN in NDI's client)", "rejected, never passed to the model", "0 in 10^4"),
     17: Row(
         "outlier jump", "gated on the fastest possible motion", "command unchanged on that tick; back within 3 ticks"
     ),
@@ -106,8 +106,8 @@ ROWS: dict[int, Row] = {
     ),
     22: Row("model gives NaN or out of range", "fault, vent", "0 NaN sent"),
     23: Row("channels do not match the robot file; protocol hash differs", "ARM refused", "all"),
-    24: Row("port busy, no permission, not our board", "clear error, own exit code", "within 3 s, no retry storm"),
-    25: Row("disk full while logging", "control goes on, the log says so", "no late tick"),
+    24: Row("port busy, no permission, not our board", "clear error, own exit code", "within 3 s, no repeated retries"),
+    25: Row("disk full while logging", "control continues, the log reports it", "no late tick"),
     26: Row(
         "starved processor, late ticks",
         "skip, never burst; log the lateness",
@@ -123,32 +123,32 @@ CLOCKS = {"emulated": "board's cycles", "virtual": "injected", "host": "wall", "
 
 HEAD = """# The failure matrix
 
-Every fault that modsoft knows, each injected by a test of its own in `tests/reliability/`, and what came of it. Made by
-`{command}` from the lines that the tests print, on {date}, {system}, {cores} cores. {score}
+Each fault is injected by its own test in `tests/reliability/`. Made by `{command}` from the lines that the tests print,
+on {date}, {system}, {cores} cores. {score}
 
-- A row: what happens, what has to follow, and when that counts as shown. It may have several lines, where it was shown
-  twice (the firmware's logic compiled for the PC; the compiled firmware on the emulated board) or has several faults.
-- Tries: how often the fault was injected. On demand they are more: `tools/reliability.py --full`, `make soak`.
-- Worst: of all tries. Clock: whose time it is in. "board's cycles" is the emulated processor's own counter and does not
-  depend on how busy the PC is; "wall" does; "injected" is a clock that the test moves.
+- A row: the fault, the required reaction, and the limit. It has several lines where it was tested twice (the firmware's
+  logic compiled for the PC; the compiled firmware on the emulated board) or has several faults.
+- Tries: how often the fault was injected. `tools/reliability.py --full` and `make soak` use more.
+- Worst: over all tries. Clock: the clock of that figure. "board's cycles" is the counter of the emulated processor and
+  does not depend on the load of the PC; "wall" does; "injected" is a clock that the test sets.
 """
 
 TAIL = """
-## What no rig shows
+## What is not tested
 
 The board is emulated (ATmega2560 on simavr, behind the MEGA's bootloader), the tracker is a fake on a pseudo-terminal,
-the robot is simulated. So nothing here shows electrical noise, brown-out, real USB latency and drivers, the dynamics of
-air in hoses, leaks and chambers, what your valves do without power, the official bootloader binary as your board
-carries it, or markers and lenses. Pressures (row 29) are voltages on the board's analogue inputs, the cable (rows 6, 7)
-is a pseudo-terminal that goes away and comes back. Try the stop keys, the pulled cable and the killed PC once on the
-real robot, at low pressure, before trusting any of it.
+and the robot is simulated. Not tested: electrical noise, brown-out, real USB latency and drivers, the dynamics of air
+in hoses, leaks and chambers, your valves without power, the bootloader binary of your board, markers and lenses.
+Pressures (row 29) are voltages on the board's analogue inputs; the cable (rows 6, 7) is a pseudo-terminal that is
+removed and created again. Before relying on the results, test the stop keys, the pulled cable and the killed PC once on
+the real robot at low pressure.
 """
 
 
 def read(path: Path) -> dict[int, list[Line]]:
-    """The lines of each row, in the order of their tests. A line that is said again replaces the one before, so that a
-    file may be added to. `ModelError` for what is no such line."""
-    found: dict[int, dict[tuple[str, str], Line]] = defaultdict(dict)
+    """The lines of each row, in the order of their tests. A repeated line replaces the first, so that a file may be
+    extended. `ModelError` for an invalid line."""
+    rows: dict[int, dict[tuple[str, str], Line]] = defaultdict(dict)
     for number, text in enumerate(read_text(path).splitlines(), start=1):
         try:
             line = json.loads(text)
@@ -156,45 +156,45 @@ def read(path: Path) -> dict[int, list[Line]]:
         except (ValueError, TypeError):
             missing = list(FIELDS)
         if missing:
-            raise ModelError(f"{path}: line {number} has no {', '.join(missing)}; make it again with pytest --matrix")
-        found[line["row"]][(line["test"], line["fault"])] = line
-    return {row: sorted(lines.values(), key=lambda line: line["test"]) for row, lines in sorted(found.items())}
+            raise ModelError(f"{path}: line {number} has no {', '.join(missing)}; write it with pytest --matrix")
+        rows[line["row"]][(line["test"], line["fault"])] = line
+    return {row: sorted(lines.values(), key=lambda line: line["test"]) for row, lines in sorted(rows.items())}
 
 
 def met(lines: Iterable[Line]) -> bool:
-    """Whether a row is shown: there is a line, and each is met."""
-    found = [line["met"] for line in lines]
-    return bool(found) and all(found)
+    """Whether a row is met: it has lines, and each is met."""
+    values = [line["met"] for line in lines]
+    return bool(values) and all(values)
 
 
 def table(rows: dict[int, list[Line]]) -> str:
-    """Markdown: every row of the matrix with its lines, or with the word that it has none."""
-    out = ["| # | fault | required | accepted when | shown as | tries | limit | worst | clock | met |"]
+    """Markdown table of every row with its lines, or with "missing"."""
+    out = ["| # | fault | required | accepted when | injected | tries | limit | worst | clock | met |"]
     out += ["| ---: | --- | --- | --- | --- | ---: | --- | --- | --- | --- |"]
     for number, row in ROWS.items():
         head = [str(number), *row]
         for line in rows.get(number, []) or [None]:
             if line is None:
-                found = ["", "", "", "", "", "**missing**"]
+                cells = ["", "", "", "", "", "**missing**"]
             else:
-                verdict = "yes" if line["met"] else f"**no**{': ' + line['why'] if line['why'] else ''}"
+                met_text = "yes" if line["met"] else f"**no**{': ' + line['why'] if line['why'] else ''}"
                 clock = CLOCKS.get(line["clock"], line["clock"])
-                found = [line["fault"], f"{line['tries']:,}", line["limit"], line["worst"], clock, verdict]
-            cells = (cell.replace("|", "\\|").replace("\n", " ") for cell in head + found)
-            out.append(f"| {' | '.join(cells)} |")
+                cells = [line["fault"], f"{line['tries']:,}", line["limit"], line["worst"], clock, met_text]
+            escaped = (cell.replace("|", "\\|").replace("\n", " ") for cell in head + cells)
+            out.append(f"| {' | '.join(escaped)} |")
             head = ["", "", "", ""]
     return "\n".join(out)
 
 
 def score(rows: dict[int, list[Line]]) -> str:
-    """One sentence: how many are met, and which are not."""
+    """One sentence: the number of rows met, and the rows that are not."""
     missing = [row for row in ROWS if not rows.get(row)]
     unmet = [row for row in ROWS if rows.get(row) and not met(rows[row])]
-    said = f"{len(ROWS) - len(missing) - len(unmet)} of {len(ROWS)} rows are met."
+    text = f"{len(ROWS) - len(missing) - len(unmet)} of {len(ROWS)} rows are met."
     for word, which in (("Not met", unmet), ("Missing", missing)):
         if which:
-            said += f" {word}: {', '.join(map(str, which))}."
-    return said
+            text += f" {word}: {', '.join(map(str, which))}."
+    return text
 
 
 def page(rows: dict[int, list[Line]], command: str) -> str:
@@ -205,7 +205,7 @@ def page(rows: dict[int, list[Line]], command: str) -> str:
 
 
 def run_tests(lines: Path, full: bool) -> int:
-    """All tests of the matrix, those judged by the wall clock after the others and alone. The first exit code not 0."""
+    """Runs all tests of the matrix, those against the wall clock last and alone; returns the first exit code not 0."""
     common = [sys.executable, "-m", "pytest", "-q", "tests/reliability", "--matrix", str(lines)]
     common += ["--matrix-full", "--timeout", "7200"] if full else []
     codes = [
@@ -216,11 +216,11 @@ def run_tests(lines: Path, full: bool) -> int:
 
 
 @click.command("reliability", help=__doc__, context_settings={"show_default": True})
-@click.option("--full", is_flag=True, help="The matrix's own numbers of tries; takes hours.")
+@click.option("--full", is_flag=True, help="The numbers of tries of the matrix; takes hours.")
 @click.option(
     "--lines",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Run nothing; make the page from the lines that pytest --matrix FILE kept.",
+    help="Run nothing; make the page from the lines of pytest --matrix FILE.",
 )
 @click.option(
     "--out",

@@ -1,4 +1,4 @@
-"""One line for every row of the failure matrix that a test has shown: printed, and kept with `--matrix FILE`.
+"""One line for every row of the failure matrix that a test covers: printed, and written with `--matrix FILE`.
 
 `make reliability` makes docs/reliability.md from these lines (tools/reliability.py).
 """
@@ -7,19 +7,19 @@ import json
 
 import pytest
 
-ROW = "matrix_row"  # Under this name a line travels in a test's report.
-CLOCKS = ("emulated", "virtual", "host", "none")  # Whose time the worst figure is in.
+ROW = "matrix_row"  # name of the line in a test's report
+CLOCKS = ("emulated", "virtual", "host", "none")  # of the worst figure
 
 
 def pytest_addoption(parser):
     group = parser.getgroup("failure matrix")
-    group.addoption("--matrix", metavar="FILE", help="append one JSON line for every row shown to this file")
+    group.addoption("--matrix", metavar="FILE", help="append one JSON line for every row to this file")
     group.addoption("--matrix-full", action="store_true", help="the matrix's full number of tries; takes hours")
 
 
 @pytest.fixture(scope="session")
 def full(pytestconfig):
-    """True where the matrix's full number of tries is asked: `tries = 100 if full else 4`."""
+    """True with --matrix-full: `tries = 100 if full else 4`."""
     return pytestconfig.getoption("--matrix-full", default=False)
 
 
@@ -27,10 +27,9 @@ def full(pytestconfig):
 def matrix_row(request):
     """matrix_row(6, fault="cable pulled", tries=10, limit="vented in 700 ms", worst="484 ms", clock="emulated").
 
-    Called once for each line, before or after the test's assertions: a row counts as met where `met` is true and
-    its test passed. A row may have several lines (native and emulated); say which in `fault`. `clock`: "emulated"
-    (the board's cycle counter), "virtual" (an injected clock), "host" (the wall clock) or "none". `why`: the reason,
-    for a line that is not met.
+    Called once for each line, before or after the test's assertions: a line is met if `met` is true and its test
+    passed. fault: distinguishes the lines of a row (native, emulated). clock: "emulated" (the board's cycle counter),
+    "virtual" (an injected clock), "host" (the wall clock) or "none". why: the reason, for a line that is not met.
     """
 
     def add(row, *, fault, tries, limit, worst, clock="none", met=True, why=""):
@@ -43,7 +42,7 @@ def matrix_row(request):
 
 
 class RowLines:
-    """Prints and keeps the lines as the tests end, in the one process that sees all reports (also under -n)."""
+    """Prints and writes the lines as the tests end, in the process that receives all reports (also under -n)."""
 
     def __init__(self, config):
         self.config = config

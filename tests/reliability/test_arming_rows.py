@@ -1,4 +1,4 @@
-"""Failure matrix, row 23: what a board must not be armed with, refused by both ends."""
+"""Failure matrix, row 23: what a board must not be armed with is refused by board and host."""
 
 import pytest
 from mega_in_run import stepped_host
@@ -28,18 +28,18 @@ pytestmark = pytest.mark.skipif(bool(missing), reason=f"simavr needs {' '.join(m
 
 
 def refusals(port):
-    """Ask a board behind `port`, heard for its second of heartbeats, for everything that it must not accept.
+    """Sends a board, after its second of heartbeats, every message that it must not accept.
 
-    Yields (what was wrong, the NACK's reason or None, the board's state after it).
+    Yields (what is wrong, the NACK's reason or None, the board's state after it).
     """
-    parser, heard, beat_s, tick = Parser(), [], float("inf"), 0
+    parser, heard, heartbeat_s, tick = Parser(), [], float("inf"), 0
 
     def wait(kind, limit_s=1.0):
-        nonlocal beat_s, tick
+        nonlocal heartbeat_s, tick
         until_s = port.clock() + limit_s
         while port.clock() < until_s:
-            if port.clock() >= beat_s:
-                beat_s, tick = beat_s + 0.1, tick + 1
+            if port.clock() >= heartbeat_s:
+                heartbeat_s, tick = heartbeat_s + 0.1, tick + 1
                 port.write(encode(Heartbeat(tick), 0, 0))
             heard.extend(frame.message for frame in parser.feed(port.read(256)))
             found = [message for message in heard if isinstance(message, kind)]
@@ -55,8 +55,8 @@ def refusals(port):
         return nack and nack.reason, wait(Status).state
 
     hello = wait(Hello, 5.0)
-    beat_s = port.clock()
-    wait(Hello, 1.3)  # that never comes: a second of heartbeats
+    heartbeat_s = port.clock()
+    wait(Hello, 1.3)  # none comes: a second of heartbeats
     right = Arm(PROTOCOL_HASH, hello.boot_id, 1, 0x3F, hello.p_full)
     wrong = [("protocol hash", right._replace(protocol_hash=PROTOCOL_HASH ^ 1 << bit)) for bit in range(32)]
     wrong += [("channels", right._replace(channels=0x3F | 1 << bit)) for bit in range(hello.channels, 16)]
@@ -66,8 +66,8 @@ def refusals(port):
     wrong += [("protocol hash of HELLO_REQ", HelloReq(PROTOCOL_HASH ^ 1 << bit)) for bit in range(32)]
     for what, message in wrong:
         yield what, *answer(message)
-    port.write(encode(right, 0, 0))  # only that was wrong
-    wait(Status)  # perhaps from just before
+    port.write(encode(right, 0, 0))  # the same message without an error
+    wait(Status)  # it may be from just before
     yield "nothing", None, wait(Status).state
 
 
@@ -107,7 +107,7 @@ def test_row_23_channels_or_protocol_hash_differ(matrix_row, monkeypatch):
         assert not [frame for frame in sent if isinstance(frame.message, Arm)]
         foreign = range(0, 32, 4)
         for bit in foreign:
-            emulated.run(1000, 0)  # so that it sees the port closed
+            emulated.run(1000, 0)  # the board sees the port closed
             monkeypatch.setattr(connection, "PROTOCOL_HASH", PROTOCOL_HASH ^ 1 << bit)
             with pytest.raises(ProtocolMismatch, match="flash the firmware of this version"):
                 stepped_host(emulated)

@@ -1,7 +1,7 @@
-"""Failure matrix, board and cable: rows 5, 6, 8, 10, 28, 29, 30, on the compiled firmware behind the real bootloader.
+"""Failure matrix, board and cable: rows 5, 6, 8, 10, 28, 29, 30, on the compiled firmware behind the bootloader.
 
-Board and host live on the board's own clock, its cycle counter, so that a busy machine changes nothing; only in row 10
-is the host a process in real time.
+Board and host run on the board's cycle counter, so that a busy machine has no influence; in row 10 the host is a
+process in real time.
 """
 
 import contextlib
@@ -39,8 +39,8 @@ pytestmark = [
     pytest.mark.timeout(1800),  # all tries on a busy machine
 ]
 
-SETTLED_S = 0.8  # after that a vent is over, whatever began it
-AT_ONCE = 2  # boards; each takes what it can get of a core
+SETTLED_S = 0.8  # longer than any vent
+AT_ONCE = 2  # boards; each uses up to one core
 
 
 def vented_ms(emulated, since, from_us):
@@ -50,9 +50,9 @@ def vented_ms(emulated, since, from_us):
 
 
 def lost_ms(host, from_us):
-    """After how long the control loop learned that the board is lost."""
+    """Time until the control loop finds the board lost."""
     with pytest.raises(LostInRun):
-        host.go_on(3.0)
+        host.run_for(3.0)
     return host.clock() * 1e3 - from_us / 1000
 
 
@@ -83,7 +83,7 @@ def test_row_05_garbage_at_line_rate(matrix_row, full):
             hear(Status, over_s + 10.0)
             [status] = heard
             assert (status.state, status.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
-            assert status.rx_good == len(sent) + 1, "nothing in the garbage was taken for a frame"
+            assert status.rx_good == len(sent) + 1, "no frame in the garbage was accepted"
             assert status.rx_bad > 100
             assert rises(emulated.trace, since) == 0
             assert not [event for event in emulated.trace[since:] if event["event"] in ("reset", "watchdog")]
@@ -119,7 +119,7 @@ def test_row_06_cable_pulled(matrix_row, full):
         with in_stepped_run() as (host, emulated):
             cut, since = inject(emulated, "unplug")
             noticed_ms = lost_ms(host, cut["t_us"])
-            assert host.board.vent() is False  # nobody said so
+            assert host.board.vent() is False, "no confirmation"
             emulated.run(round(SETTLED_S * 1e6), 0)
             assert rises(emulated.trace, since) == 0
             return vented_ms(emulated, since, cut["t_us"]), noticed_ms
@@ -147,13 +147,13 @@ def test_row_08_board_reset_in_mid_run(matrix_row, full):
             reset, since = inject(emulated, ("reset", "power-cycle")[number % 2])
             noticed_ms = lost_ms(host, reset["t_us"])
             silent = len(host.port.written)
-            assert host.board.vent(), "it is back, vented, and says so"
+            assert host.board.vent(), "the board restarted and confirms the vent"
             back_ms = host.clock() * 1e3 - reset["t_us"] / 1000
             assert host.board.status.boot_id != host.board.hello.boot_id
             assert (host.board.status.state, host.board.status.faults) == (State.IDLE, 0)
             with pytest.raises(LostInRun):
                 host.board.set_pressures(host.tick + 1, [Host.BAR])
-            assert len(host.port.written) == silent, "not a byte after it noticed"
+            assert len(host.port.written) == silent, "no byte after the loss was found"
             assert rises(emulated.trace, since) == 0
             return vented_ms(emulated, since, reset["t_us"]), noticed_ms, back_ms
 
@@ -210,7 +210,7 @@ def test_row_28_firmware_hangs(matrix_row, full):
             hang, since = inject(emulated, ("hang", "hang cli")[number % 2], "hang")
             assert lost_ms(host, hang["t_us"]) < 1200
             assert any(map(is_event("reset", cause="watchdog"), emulated.trace[since:]))
-            assert host.board.vent(), "it runs again and says so"
+            assert host.board.vent(), "the board restarted and confirms the vent"
             assert host.board.status.boot_id == host.board.hello.boot_id + 1
             assert rises(emulated.trace, since) == 0
             return vented_ms(emulated, since, hang["t_us"])
@@ -224,7 +224,7 @@ def test_row_28_firmware_hangs(matrix_row, full):
 
 
 def test_row_29_sensors(matrix_row, full):
-    """A sensor of each channel, at 0.35 bar in every chamber: far above, somewhat above, below what is commanded."""
+    """A sensor of each channel, with 0.35 bar in every chamber: far above, above, and below the set-point."""
     faults = [("over-pressure", 0.5, Fault.OVER_PRESSURE), ("stuck", 0.42, Fault.SENSOR), ("leak", 0.25, Fault.LEAK)]
 
     def attempt(number):
@@ -234,7 +234,7 @@ def test_row_29_sensors(matrix_row, full):
                 shown = f"adc {number % 6} {emulated.millivolt(shown_bar)}\nstats"
                 event, since = inject(emulated, shown, "stats")
                 with pytest.raises(Tripped, match=fault.name):
-                    host.go_on(4.0)
+                    host.run_for(4.0)
                 began_us = next(event["t_us"] for event in emulated.trace[since:] if event["event"] == "pwm")
                 emulated.send("sensors 20")
                 assert host.board.vent()
@@ -247,13 +247,13 @@ def test_row_29_sensors(matrix_row, full):
         return times_ms
 
     tries = 60 if full else 6
-    found = dict(zip((name for name, *_ in faults), worst(side_by_side(tries, attempt, AT_ONCE)), strict=True))
+    results = dict(zip((name for name, *_ in faults), worst(side_by_side(tries, attempt, AT_ONCE)), strict=True))
     matrix_row(
         29,
         fault="over-pressure: dumped",
         tries=tries,
         limit="all 0 in 110 ms",
-        worst=f"{found['over-pressure']:.1f} ms",
+        worst=f"{results['over-pressure']:.1f} ms",
         clock="emulated",
     )
     for name in ("stuck", "leak"):
@@ -263,15 +263,15 @@ def test_row_29_sensors(matrix_row, full):
             fault=f"{fault}: vent begins",
             tries=tries,
             limit="2.1 s",
-            worst=f"{found[name] / 1000:.3f} s",
+            worst=f"{results[name] / 1000:.3f} s",
             clock="emulated",
         )
-    assert found["over-pressure"] <= 110
-    assert max(found["stuck"], found["leak"]) <= 2100
+    assert results["over-pressure"] <= 110
+    assert max(results["stuck"], results["leak"]) <= 2100
 
 
 def test_row_30_host_does_not_read(matrix_row, full):
-    """While the outputs slew they move in every pass of the firmware's loop: the time between is that of the loop."""
+    """Slewing outputs change in every pass of the firmware's loop, so their intervals are those of the loop."""
     seconds = 600 if full else 30
 
     def attempt(_):
@@ -293,7 +293,7 @@ def test_row_30_host_does_not_read(matrix_row, full):
             assert stats["tx_unread"] > 1000, "the line is full"
             moved_us = [event["t_us"] for event in emulated.trace[since:] if is_event("pwm", channel=0)(event)]
             gaps_ms = [(later - earlier) / 1000 for earlier, later in pairwise(moved_us)]
-            slewing_ms = [gap for gap in gaps_ms if gap < STANDS_MS]
+            slewing_ms = [gap for gap in gaps_ms if gap < CONSTANT_MS]
             assert len(slewing_ms) > 300 * seconds
             return max(slewing_ms) - 1.0, stats["firmware_max_awake_us"] / 1000
 
@@ -311,4 +311,4 @@ def test_row_30_host_does_not_read(matrix_row, full):
     assert awake < 2.0
 
 
-STANDS_MS = 50  # the way from 0.08 to 0.35 bar takes 135 ms of the 300 until the next set-point
+CONSTANT_MS = 50  # an interval of constant outputs: the ramp from 0.08 to 0.35 bar takes 135 of 300 ms

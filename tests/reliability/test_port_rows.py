@@ -25,35 +25,35 @@ pytestmark = pytest.mark.skipif(bool(missing), reason=f"simavr needs {' '.join(m
 
 
 def test_row_07_plugged_in_again_under_another_name(matrix_row, tmp_path, monkeypatch):
-    where = {}  # serial number: device, as the operating system would list them
-    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [mega(*item) for item in where.items()])
+    devices = {}  # by serial number, as the operating system lists them
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [mega(*item) for item in devices.items()])
 
     def attempt(number):
         serial_number = f"7523733353635180{number:04}"
         with in_stepped_run() as (host, emulated):
             inject(emulated, "unplug")
             with pytest.raises(LostInRun):
-                host.go_on(1.0)
+                host.run_for(1.0)
             host.board.close()
             emulated.run(round(random.uniform(1.0, 1e6)), 0)
-            where[serial_number] = elsewhere = str(tmp_path / f"ttyACM{number}")
-            plugged, since = inject(emulated, f"plug {elsewhere}")
+            devices[serial_number] = new_name = str(tmp_path / f"ttyACM{number}")
+            plugged, since = inject(emulated, f"plug {new_name}")
             with pytest.raises(DeviceAbsent, match="no such port"):
                 ports.find_port(emulated.port)
-            again = stepped_host(emulated, ports.find_port(serial_number))
-            assert again.board.hello.boot_id != host.board.hello.boot_id
-            await_state(again.board, State.IDLE)
-            idle_s = again.clock() - plugged["t_us"] * 1e-6
-            idle_until_s = again.clock() + 0.5
-            while again.clock() < idle_until_s:
-                again.board._line.pump()
-            assert again.board.status.state == State.IDLE, "never by itself"
-            again.board.arm(Host.ROBOT)
-            assert again.board.status.state == State.ARMED
+            second = stepped_host(emulated, ports.find_port(serial_number))
+            assert second.board.hello.boot_id != host.board.hello.boot_id
+            await_state(second.board, State.IDLE)
+            idle_s = second.clock() - plugged["t_us"] * 1e-6
+            idle_until_s = second.clock() + 0.5
+            while second.clock() < idle_until_s:
+                second.board._line.pump()
+            assert second.board.status.state == State.IDLE, "never by itself"
+            second.board.arm(Host.ROBOT)
+            assert second.board.status.state == State.ARMED
             assert rises(emulated.trace, since) == 0
-            again.go_on(0.1)
-            assert again.board.status.state == State.RUNNING
-            again.board.close()
+            second.run_for(0.1)
+            assert second.board.status.state == State.RUNNING
+            second.board.close()
             return idle_s
 
     tries = 20
@@ -89,27 +89,27 @@ main()
 
 @pytest.mark.realtime
 def test_row_07_the_next_run_finds_the_board_by_its_serial_number(matrix_row, model_file, tmp_path):
-    elsewhere, number = str(tmp_path / "ttyACM1"), "75237333536351801234"
-    here = (sys.executable, "-c", WITH_ONE_MEGA, number, elsewhere)
+    new_name, number = str(tmp_path / "ttyACM1"), "75237333536351801234"
+    program = (sys.executable, "-c", WITH_ONE_MEGA, number, new_name)
     with Stand() as stand:
         with Run(stand, model_file, tmp_path / "first") as run:
             run.wait_for(lambda: run.ticks() >= 2)
             inject(stand.board, "unplug")
             assert run.left()[0] == 74, run.said
-        _, since = inject(stand.board, f"plug {elsewhere}")
-        with Run(stand, model_file, tmp_path / "second", program=here) as run:
+        _, since = inject(stand.board, f"plug {new_name}")
+        with Run(stand, model_file, tmp_path / "second", program=program) as run:
             assert run.process.wait(30) == 69
-        assert f"there is an Arduino MEGA at {elsewhere}, which --port {number}" in run.said
+        assert f"there is an Arduino MEGA at {new_name}, which --port {number}" in run.said
         assert not [event for event in stand.board.trace[since:] if event["event"] == "uart-open"], "nothing opened"
-        with Run(stand, model_file, tmp_path / "third", "--port", number, "--steps", "3", program=here) as run:
+        with Run(stand, model_file, tmp_path / "third", "--port", number, "--steps", "3", program=program) as run:
             assert run.left()[0] == 0, run.said
-        assert run.log().meta["port"] == elsewhere
+        assert run.log().meta["port"] == new_name
     matrix_row(
         7,
         fault="plugged in again under another name: the next run",
         tries=1,
         limit="74; 69 and where the board is; then found by --port SERIAL",
-        worst="as it must",
+        worst="as required",
     )
 
 
@@ -124,17 +124,17 @@ def await_status(board, state, limit_s=5.0):
         time.sleep(0.005)
 
 
-def test_row_09_host_would_talk_to_the_bootloader(matrix_row):
+def test_row_09_no_byte_to_the_bootloader(matrix_row):
     opens = 20
 
     def attempt(_):
         with EmulatedBoard("simavr", stepped=True) as emulated:
             for _ in range(opens - 1):
                 stepped_host(emulated).board.close()
-                emulated.run(round(random.uniform(1.0, 3e5)), 0)  # what was written last may still be on its way
-            inject(emulated, "drop-tx 1")  # the announcement is lost, and the host has to ask
+                emulated.run(round(random.uniform(1.0, 3e5)), 0)  # the last bytes may still be in transit
+            inject(emulated, "drop-tx 1")  # HELLO is lost, so the host requests it
             port = SteppedPort(emulated)
-            hear_from(port, 1.2, lambda: inject(emulated, "drop-tx 0"))
+            call_in_read(port, 1.2, lambda: inject(emulated, "drop-tx 0"))
             Board(port, "the emulated MEGA", port.clock, threaded=False).close()
             emulated.run(1000, 0)
         opened = sum(event["event"] == "uart-open" for event in emulated.trace)
@@ -142,20 +142,20 @@ def test_row_09_host_would_talk_to_the_bootloader(matrix_row):
         assert emulated.summary["rx"] > 0, "and bytes are counted"
         return emulated.summary["rx_bootloader"]
 
-    found = sum(side_by_side(5, attempt, 2))
+    count = sum(side_by_side(5, attempt, 2))
     matrix_row(
         9,
-        fault="host would talk to the bootloader",
+        fault="host could send to the bootloader",
         tries=5 * opens,
         limit="0 bytes in 100 opens",
-        worst=f"{found} bytes",
+        worst=f"{count} bytes",
         clock="none",
     )
-    assert found == 0
+    assert count == 0
 
 
-def hear_from(port, seconds, call):
-    """Have `call` done in the first read of the port that begins so long after now."""
+def call_in_read(port, seconds, call):
+    """Calls `call` in the first read of the port after this time."""
     read, due_s = port.read, port.clock() + seconds
 
     def reading(size=1):
@@ -167,11 +167,11 @@ def hear_from(port, seconds, call):
     port.read = reading
 
 
-# ---- Not a port for us
+# ---- Ports that are refused
 
 
 @contextlib.contextmanager
-def permitted_to_nobody(device):
+def without_permission(device):
     """A port that this process may not open."""
     if os.geteuid() == 0:  # root may open anything
         os.seteuid(65534)
@@ -189,38 +189,38 @@ def permitted_to_nobody(device):
 
 
 @contextlib.contextmanager
-def stranger(text):
-    """The port of a device that says `text` ten times a second, whatever is done to it: not our board."""
+def other_device(text):
+    """The port of another device, which sends `text` ten times a second."""
     master, slave = os.openpty()
     code = "import os, sys, time\nwhile True:\n os.write(1, sys.argv[1].encode()); time.sleep(0.1)"
-    talker = subprocess.Popen([sys.executable, "-c", code, text], stdout=master)
+    sender = subprocess.Popen([sys.executable, "-c", code, text], stdout=master)
     try:
         yield os.ttyname(slave)
     finally:
-        talker.kill()
-        talker.wait()
+        sender.kill()
+        sender.wait()
         os.close(slave)
         os.close(master)
 
 
-def closed(emulated, times):
-    """Wait until the board has seen its port closed so often: one closed and opened at once stays open for it."""
+def wait_closed(emulated, times):
+    """Waits until the board has seen its port closed `times` times; it does not see one that is reopened at once."""
     emulated.wait_for(lambda _: sum(event["event"] == "uart-close" for event in emulated.trace) >= times, 5.0)
 
 
 @pytest.mark.realtime
-def test_row_24_port_busy_as_modsoft_runtime_tells_it(matrix_row, model_file, tmp_path):
+def test_row_24_port_busy_message_of_modsoft_runtime(matrix_row, model_file, tmp_path):
     with Stand() as stand, contextlib.closing(ports.open_port(stand.board.port, 250000)):
         with Run(stand, model_file, tmp_path) as run:
             assert run.process.wait(30) == 75
         assert run.said.splitlines()[-1].startswith(f"modsoft-runtime: {stand.board.port} is in use by another program")
         assert not run.armed()
         assert stand.highest_bar() == 0.0
-    matrix_row(24, fault="port busy, modsoft-runtime", tries=1, limit="exit 75, one line", worst="as it must")
+    matrix_row(24, fault="port busy, modsoft-runtime", tries=1, limit="exit 75, one line", worst="as required")
 
 
 @pytest.mark.realtime
-def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypatch):
+def test_row_24_port_busy_not_permitted_or_of_another_device(matrix_row, tmp_path, monkeypatch):
     took_s = {}
 
     def refused(what, name, kind, exit_code, baud=250000):
@@ -236,22 +236,22 @@ def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypat
     refused("a file", str(tmp_path / "file"), DeviceAbsent, 69)
     refused("not there", str(tmp_path / "none"), DeviceAbsent, 69)
     with EmulatedBoard("simavr") as emulated:
-        with permitted_to_nobody(emulated.ready["port"]):
+        with without_permission(emulated.ready["port"]):
             refused("not permitted", emulated.ready["port"], PortBusy, 75)
         with contextlib.closing(ports.open_port(emulated.port, 250000)):
             emulated.wait_for(is_event("uart-open"), 5.0)
             refused("busy", emulated.port, PortBusy, 75)
-        closed(emulated, 1)
+        wait_closed(emulated, 1)
         refused("at the wrong rate", emulated.port, DeviceAbsent, 69, baud=115200)
-        closed(emulated, 2)
+        wait_closed(emulated, 2)
         with monkeypatch.context() as another:
             another.setattr(connection, "PROTOCOL_HASH", PROTOCOL_HASH ^ 1)
             refused("of another version", emulated.port, ProtocolMismatch, 76)
     opened = sum(event["event"] == "uart-open" for event in emulated.trace)
     assert opened == 3, "busy, at the wrong rate, of another version: each once"
-    with stranger("temperature 23.5 humidity 40\r\n") as name:
+    with other_device("temperature 23.5 humidity 40\r\n") as name:
         refused("of another device", name, DeviceAbsent, 69)
-    with stranger("") as name:
+    with other_device("") as name:
         mute = SimpleNamespace(device=name, description="Scale", vid=0x0B95, pid=1, serial_number=None)
         monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [mute])
         refused("of a mute device of another maker", name, DeviceAbsent, 69)
@@ -260,11 +260,11 @@ def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypat
         24,
         fault=f"port {', '.join(took_s)}",
         tries=len(took_s),
-        limit="own exit code in 3 s, no retry storm",
+        limit="own exit code in 3 s, no repeated retries",
         worst=f"{took_s[worst]:.2f} s ({worst}), opened once each",
         clock="host",
     )
-    mute_s, resets = given_up_when_mute()
+    mute_s, resets = time_to_give_up()
     matrix_row(
         24,
         fault="port of a mute device that may be our board",
@@ -277,8 +277,8 @@ def test_row_24_port_busy_not_permitted_not_ours(matrix_row, tmp_path, monkeypat
     assert (mute_s, resets) == (pytest.approx(12.3, abs=0.2), 3)
 
 
-def given_up_when_mute():
-    """Seconds after which a port without a byte is given up, and how many resets were tried before."""
+def time_to_give_up():
+    """Seconds until a port without a byte is given up, and the number of resets before."""
     silent, hundredths = connection.Connection(0.0), 0
     while not silent.gave_up:
         hundredths += 1

@@ -1,4 +1,4 @@
-"""The page of the failure matrix: from the lines alone, with what is missing and what is not met named."""
+"""The page of the failure matrix, made from the lines: missing and unmet rows are named."""
 
 import importlib.util
 import json
@@ -27,7 +27,7 @@ def line(row, **values):
 
 
 def made(folder, *lines):
-    """The command on these lines: (exit code, standard output, the page)."""
+    """Runs the command on these lines; returns (exit code, its output, the page)."""
     kept, page = folder / "lines.jsonl", folder / "page.md"
     kept.write_text("".join(json.dumps(each) + "\n" for each in lines))
     done = subprocess.run(
@@ -44,38 +44,38 @@ def test_every_row_of_the_matrix_has_its_test():
     assert sorted(set(map(int, names))) == list(ALL)
 
 
-def test_a_whole_matrix_is_30_of_30(tmp_path):
-    code, said, page = made(tmp_path, *map(line, ALL))
-    assert (code, "30 of 30 rows are met." in said) == (0, True)
+def test_complete_matrix_is_30_of_30(tmp_path):
+    code, output, page = made(tmp_path, *map(line, ALL))
+    assert (code, "30 of 30 rows are met." in output) == (0, True)
     assert page.count("| 484 ms | board's cycles | yes |") == 30
 
 
-def test_a_row_without_a_line_is_missing(tmp_path):
-    code, said, page = made(tmp_path, *(line(row) for row in ALL if row not in (7, 30)))
-    assert (code, "28 of 30 rows are met. Missing: 7, 30." in said) == (1, True)
+def test_row_without_a_line_is_missing(tmp_path):
+    code, output, page = made(tmp_path, *(line(row) for row in ALL if row not in (7, 30)))
+    assert (code, "28 of 30 rows are met. Missing: 7, 30." in output) == (1, True)
     assert page.count("**missing**") == 2
 
 
-def test_one_line_that_is_not_met_spoils_its_row_and_says_why(tmp_path):
+def test_row_with_an_unmet_line_is_unmet(tmp_path):
     lines = [*map(line, ALL), line(30, fault="emulated", worst="2.2 ms", met=False, why="one long pass")]
-    code, said, page = made(tmp_path, *lines)
-    assert (code, "29 of 30 rows are met. Not met: 30." in said) == (1, True)
+    code, output, page = made(tmp_path, *lines)
+    assert (code, "29 of 30 rows are met. Not met: 30." in output) == (1, True)
     assert "| 2.2 ms | board's cycles | **no**: one long pass |" in page
 
 
-def test_a_line_said_again_replaces_the_one_before(tmp_path, reliability):
+def test_repeated_line_replaces_the_first(tmp_path, reliability):
     kept = tmp_path / "lines.jsonl"
     kept.write_text("".join(json.dumps(line(3, worst=worst)) + "\n" for worst in ("900 ms", "484 ms")))
     assert [each["worst"] for each in reliability.read(kept)[3]] == ["484 ms"]
 
 
-def test_what_is_no_line_of_the_matrix_is_said(tmp_path):
-    code, said, page = made(tmp_path, line(1), {"row": 2})
+def test_invalid_line_is_refused(tmp_path):
+    code, output, page = made(tmp_path, line(1), {"row": 2})
     assert (code, page) == (65, "")
-    assert "line 2 has no fault" in said
+    assert "line 2 has no fault" in output
 
 
-def test_the_lines_are_printed_and_kept_and_count_only_where_the_test_passed(tmp_path):
+def test_lines_are_printed_and_written_and_count_only_if_the_test_passed(tmp_path):
     folder = tmp_path / "reliability"
     folder.mkdir()
     (folder / "conftest.py").write_text((HERE / "conftest.py").read_text())
@@ -88,7 +88,7 @@ def test_the_lines_are_printed_and_kept_and_count_only_where_the_test_passed(tmp
     )
     kept = tmp_path / "lines.jsonl"
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", folder, "--matrix", kept, "--matrix-full"]
-    said = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=60).stdout
-    assert '{"row": 6, "tries": 100, "limit": "700 ms", "worst": "484 ms"}' in said
+    output = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=60).stdout
+    assert '{"row": 6, "tries": 100, "limit": "700 ms", "worst": "484 ms"}' in output
     found = [json.loads(text) for text in kept.read_text().splitlines()]
     assert [(each["row"], each["met"]) for each in found] == [(6, True), (7, False)]

@@ -221,7 +221,7 @@ def test_row_11_the_fault_stays_latched_for_a_host_that_comes_back(fault, error,
                 beat_for(host, 2.0)
             since = len(emulated.trace)
             with pytest.raises(error):
-                host.go_on(1.0)
+                host.run_for(1.0)
             host.board.publish_tick(host.tick + 100)
             beat_for(host, 1.0)
             assert (host.board.status.state, host.board.status.faults) == (State.FAULT, fault)

@@ -1,5 +1,5 @@
-"""modsoft-runtime with faults at hand: SIGUSR1 raises an exception that nobody foresaw wherever the control thread
-is, SIGUSR2 halts that thread for five seconds while all others go on."""
+"""modsoft-runtime with faults: SIGUSR1 raises an unexpected exception in the control thread, SIGUSR2 halts that thread
+for five seconds while all others run."""
 
 import signal
 import time
@@ -7,12 +7,12 @@ import time
 from modsoft.runtime.cli import main
 
 
-class Unforeseen(Exception):
+class UnexpectedError(Exception):
     """A bug."""
 
 
 def fail(number, frame):
-    raise Unforeseen("a bug, injected")
+    raise UnexpectedError("a bug, injected")
 
 
 if __name__ == "__main__":

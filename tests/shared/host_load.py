@@ -1,7 +1,7 @@
-"""The host-load check: whether the machine itself stalled while a test was judged against the wall clock.
+"""The host-load check: whether the machine stalled during a test against the wall clock.
 
-A process of its own sleeps for 5 ms at a time and keeps by how much it woke up late. A machine that starves it for
-longer than LIMIT_S starves the runtime and the rig too: a control tick is then late by no fault of theirs.
+A process sleeps for 5 ms at a time and measures how late it wakes up. A machine that delays it by more than LIMIT_S
+delays the runtime and the rig too: a late control tick is then no fault of theirs.
 """
 
 import subprocess
@@ -9,17 +9,17 @@ import sys
 
 import pytest
 
-LIMIT_S = 0.1  # as the rig's own (modsoft.hil.criteria): the shortest time-out of the board is 0.3 s
+LIMIT_S = 0.1  # as in modsoft.hil.criteria: the shortest time-out of the board is 0.3 s
 SLEEPERS: set[int] = set()  # process ids of running checks
 _SLEEPER = """
 import select, sys, time
 worst = 0.0
 last = time.monotonic()
 while True:
-    asked, _, _ = select.select([sys.stdin], [], [], 0.005)
+    readable, _, _ = select.select([sys.stdin], [], [], 0.005)
     now = time.monotonic()
     worst, last = max(worst, now - last - 0.005), now
-    if asked:
+    if readable:
         if not sys.stdin.readline():
             break
         print(worst, flush=True)
@@ -28,7 +28,7 @@ while True:
 
 
 class HostLoad:
-    """Measures from its start; `worst_s` gives the longest stall since the call before."""
+    """Measures from its start; `worst_s` returns the longest stall since the last call."""
 
     def __init__(self) -> None:
         self._sleeper = subprocess.Popen(
@@ -50,12 +50,12 @@ class HostLoad:
         SLEEPERS.discard(self._sleeper.pid)
 
 
-def judged(report: pytest.TestReport, worst_s: float) -> pytest.TestReport:
-    """The report of a test against the wall clock: a failure while the host stalled is no verdict, and is shown as a
-    skipped test with the reason."""
+def excused(report: pytest.TestReport, worst_s: float) -> pytest.TestReport:
+    """The report of a test against the wall clock; a failure while the host stalled becomes a skipped test with the
+    reason."""
     if report.failed and worst_s > LIMIT_S:
-        reason = f"not judged: host-load check, this machine stalled for {worst_s * 1e3:.0f} ms during the test"
-        report.sections.append(("failure that is not judged", str(report.longrepr)))
+        reason = f"inconclusive: host-load check, this machine stalled for {worst_s * 1e3:.0f} ms during the test"
+        report.sections.append(("failure while the host stalled", str(report.longrepr)))
         report.outcome = "skipped"
         report.longrepr = (report.nodeid, report.location[1] or 0, f"Skipped: {reason}")
     return report

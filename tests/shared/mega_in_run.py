@@ -1,7 +1,7 @@
-"""The runtime's own host side on an emulated MEGA in mid-run, for faults of board, cable and bootloader.
+"""The runtime's `Board` on an emulated MEGA in mid-run, for faults of board, cable and bootloader.
 
-Run as a program, `python mega_in_run.py PORT...`, it drives the boards at these ports until it is killed, and prints a
-line as soon as all of them are at `Host.BAR`.
+`python mega_in_run.py PORT...` drives the boards at these ports until it is killed; it prints a line when all of them
+are at `Host.BAR`.
 """
 
 import contextlib
@@ -19,16 +19,16 @@ from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.ports import open_port
 from modsoft.runtime.board.protocol import State
 
-CHECK_S = 0.005  # how often the real loop looks between two ticks
+CHECK_S = 0.005  # as the control loop between two ticks
 
 
 class Host:
-    """Six chambers at `BAR`, a set-point every `PERIOD_S`.
+    """Keeps six chambers at `BAR`, with a set-point every `PERIOD_S`.
 
-    threaded: False leaves the port to the caller's thread, which may then take over the wire itself.
+    threaded: False leaves the port to the caller's thread.
     """
 
-    BAR = 0.35  # the most that the shipped robot allows: the longest way down
+    BAR = 0.35  # the limit of the shipped robot: the longest ramp
     PERIOD_S = 0.4
     ROBOT = robots.load("pneumatic-3")
 
@@ -39,14 +39,14 @@ class Host:
         self.due_s = clock()
 
     def start(self):
-        """Arm, and go on until the board has said that every chamber is told `BAR`."""
+        """Arms and runs until the board reports `BAR` for every chamber."""
         self.board.arm(self.ROBOT)
-        self.go_on(3 * self.PERIOD_S)
+        self.run_for(3 * self.PERIOD_S)
         assert self.board.status.state == State.RUNNING
         assert min(self.board.applied_bar[:6]) == self.BAR
 
-    def go_on(self, seconds):
-        """The control loop for so long. Raises what `Board.check` raises, as soon as the loop can know."""
+    def run_for(self, seconds):
+        """Runs the control loop for this time; raises the errors of `Board.check`."""
         until_s = self.clock() + seconds
         while (now_s := self.clock()) < until_s:
             self.board.check()
@@ -68,7 +68,7 @@ def in_run(threaded=True):
         host = Host(open_port(emulated.port, Host.ROBOT.serial.baud), threaded)
         try:
             host.start()
-            host.go_on(random.uniform(0.0, Host.PERIOD_S))
+            host.run_for(random.uniform(0.0, Host.PERIOD_S))
             yield host, emulated
         finally:
             host.board._line.close()
@@ -82,8 +82,8 @@ def in_stepped_run():
         host = stepped_host(emulated)
         try:
             host.start()
-            host.go_on(random.uniform(0.0, Host.PERIOD_S))
-            host.port.idle(random.uniform(1e-6, 2e-3))  # anywhere in a pass of the firmware
+            host.run_for(random.uniform(0.0, Host.PERIOD_S))
+            host.port.idle(random.uniform(1e-6, 2e-3))  # at a random phase of the firmware's loop
             yield host, emulated
         finally:
             host.port.close()
@@ -96,24 +96,24 @@ def stepped_host(emulated, name=""):
 
 
 def inject(emulated, command, name="command"):
-    """Give the board a command; its event `name`, and how long the trace was before it."""
+    """Sends the board a command; returns its event `name` and the length of the trace before it."""
     since = len(emulated.trace)
     emulated.send(command)
     return emulated.wait_for(lambda event: event["event"] == name, 5.0, since), since
 
 
 def side_by_side(tries, attempt, at_once=5):
-    """What `attempt(number)` returns, for every number below `tries`, several at once: a board is mostly idle."""
+    """Results of `attempt(number)` for every number below `tries`, several at once: a board is mostly idle."""
     with ThreadPoolExecutor(at_once) as pool:
         return list(pool.map(attempt, range(tries)))
 
 
 def main(names):
-    """Drive the boards at these ports for ever."""
+    """Drives the boards at these ports until the process ends."""
     hosts = side_by_side(len(names), lambda number: Host(open_port(names[number], 250_000)), len(names))
     side_by_side(len(hosts), lambda number: hosts[number].start(), len(hosts))
     print("in run", flush=True)
-    side_by_side(len(hosts), lambda number: hosts[number].go_on(3600.0), len(hosts))
+    side_by_side(len(hosts), lambda number: hosts[number].run_for(3600.0), len(hosts))
 
 
 if __name__ == "__main__":

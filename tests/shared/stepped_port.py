@@ -1,4 +1,4 @@
-"""A serial port on a stepped emulated board: the host lives on its clock, and a busy machine disturbs neither."""
+"""A serial port on a stepped emulated board: host and board share its clock, so a busy machine disturbs neither."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import serial
 from modsoft.hil.board.emulator import EmulatedBoard
 
 STEP_US = 5000  # a read of the runtime's port waits 5 ms
-HELD_AT_MOST = 2048  # by a pseudo-terminal that nobody reads; it has room for more
-ARRIVES_IN_S = 1.0  # in real time
+BUFFERED_AT_MOST = 2048  # by a pseudo-terminal that no process reads; it has room for more
+ARRIVES_IN_S = 1.0  # real time
 
 
 class SteppedPort:
-    """What `modsoft.runtime.board.board.Board` uses of a port, for `threaded=False` and `clock=port.clock`.
+    """The part of a serial port that `modsoft.runtime.board.board.Board` uses; for `threaded=False, clock=port.clock`.
 
-    A read without data lets 5 ms pass. What was written arrives in the next step, and what the board sent in a
-    step can be read after it.
+    A read without data lets 5 ms pass. Written bytes arrive in the next step; bytes that the board sends in a step can
+    be read after it.
     """
 
     def __init__(self, board: EmulatedBoard, name: str = "", baud: int = 250_000) -> None:
-        """`board`: started with `stepped`. `name`: of its port, where that was plugged in again under another one."""
+        """board: started with `stepped`. name: of the port, where it was plugged in again under another name."""
         self.dtr = True
         self.written: list[tuple[float, bytes]] = []  # (clock, bytes)
         self._board = board
@@ -33,7 +33,7 @@ class SteppedPort:
         return float(self._board.ran["t_us"]) * 1e-6
 
     def idle(self, seconds: float) -> None:
-        """Let time pass, without a look at what comes in it."""
+        """Let time pass without reading."""
         self._step(round(seconds * 1e6))
 
     @property
@@ -53,7 +53,7 @@ class SteppedPort:
         return self._port.write(data)
 
     def cancel_read(self) -> None:
-        """Nobody else could be in one."""
+        """Does nothing: no other thread reads."""
 
     def open(self) -> None:
         self._port.open()
@@ -63,7 +63,7 @@ class SteppedPort:
 
     def _step(self, microseconds: int) -> None:
         to_host = self._board.run(microseconds, self._from_host)["to_host"]
-        on_its_way = min(to_host - self._taken, HELD_AT_MOST)
+        in_transit = min(to_host - self._taken, BUFFERED_AT_MOST)
         until_s = time.monotonic() + ARRIVES_IN_S
-        while self.in_waiting < on_its_way and time.monotonic() < until_s:
+        while self.in_waiting < in_transit and time.monotonic() < until_s:
             time.sleep(0)

@@ -1,4 +1,4 @@
-"""A bare host that sends an emulated MEGA in mid-run one bad frame after the other, each followed by a good one."""
+"""A bare host that sends corrupted frames to an emulated MEGA in mid-run, each followed by a valid one."""
 
 import random
 import time
@@ -22,15 +22,15 @@ from modsoft.runtime.board.protocol import (
 )
 
 BAUD = 250_000
-BEAT_S = 0.1
+HEARTBEAT_S = 0.1
 TIMEOUT_S = 10.0
 SETTLE_S = 0.3  # 0.35 bar at 2 bar/s, and a status
 TRIES_PER_WRITE = 16  # 25 ms of the line
 
 
-class Storm:
-    """The board runs at `STEADY`; whatever moves a valve from there on was wrongly applied. Judged by the board's own
-    registers and counters, so on its own clock."""
+class FrameCorruption:
+    """The board runs at `STEADY`: any later change of a valve comes from a frame that was wrongly accepted. The result
+    is read from the board's registers and counters, in emulated time."""
 
     STEADY = (2000,) * 11 + (0,)
     OTHER = (1000,) * 11 + (0,)
@@ -39,17 +39,17 @@ class Storm:
         self.random = random.Random(seed)
         self.emulated = EmulatedBoard("simavr", bootloader=False)
         self.parser = Parser()
-        self.session = self.seq = self.tick = self.good = self.base_good = self.refused = 0
+        self.session = self.seq = self.tick = self.valid_count = self.base_valid_count = self.refused_count = 0
 
     def __enter__(self):
         self.emulated.start()
         self.emulated.send("sensors 20")
         self.port = serial.Serial(self.emulated.port, BAUD, timeout=0.005, exclusive=True)
-        self.hello = self.answer(Hello)
-        for pressures in (self.OTHER, self.STEADY):  # the first session is there to be replayed later
+        self.hello = self.wait_for(Hello)
+        for pressures in (self.OTHER, self.STEADY):  # the first session is replayed later
             self.begin_session(pressures)
         self.base = self.status()
-        self.base_good = self.good
+        self.base_valid_count = self.valid_count
         self.since = len(self.emulated.trace)
         return self
 
@@ -57,14 +57,14 @@ class Storm:
         self.port.close()
         self.emulated.stop()
 
-    # ---- what a host does
+    # ---- valid frames
 
     def write(self, message, seq=0):
-        self.good += 1
+        self.valid_count += 1
         self.port.write(encode(message, seq, self.session))
 
-    def answer(self, kind):
-        """The next message of this kind."""
+    def wait_for(self, kind):
+        """Returns the next message of this kind."""
         until_s = time.monotonic() + TIMEOUT_S
         while time.monotonic() < until_s:
             for frame in self.parser.feed(self.port.read(256)):
@@ -77,14 +77,14 @@ class Storm:
         for _ in range(13):
             self.tick += 1
             self.write(Heartbeat(self.tick))
-            time.sleep(BEAT_S)
+            time.sleep(HEARTBEAT_S)
         self.seq = 0
         self.write(Arm(protocol.PROTOCOL_HASH, self.hello.boot_id, self.session + 1, 0x7FF, self.hello.p_full))
         self.session += 1
         until_s = time.monotonic() + SETTLE_S
         while time.monotonic() < until_s:
             self.write(*self.next_set(pressures))
-            time.sleep(BEAT_S / 2)
+            time.sleep(HEARTBEAT_S / 2)
         assert self.status().state == State.RUNNING
 
     def next_set(self, pressures):
@@ -93,19 +93,19 @@ class Storm:
         return Set(self.tick, pressures), self.seq
 
     def status(self):
-        """A STATUS that the board wrote after it had taken all that was sent."""
-        for _ in range(3):  # what is still on its way arrives meanwhile
+        """A STATUS that the board wrote after it received every frame."""
+        for _ in range(3):  # frames in transit arrive meanwhile
             self.tick += 1
             self.write(Heartbeat(self.tick))
-            time.sleep(BEAT_S)
+            time.sleep(HEARTBEAT_S)
         self.write(HelloReq(protocol.PROTOCOL_HASH))
-        self.answer(Hello)
-        return self.answer(Status)
+        self.wait_for(Hello)
+        return self.wait_for(Status)
 
-    # ---- bad frames
+    # ---- corrupted frames
 
     def random_frame(self):
-        """Some good frame, whose content would be seen if it were taken."""
+        """A random valid frame with an effect that shows if the board accepts it."""
         message = self.random.choice(
             (
                 Set(self.tick + 1, (*(self.random.randrange(3501) for _ in range(11)), 0)),
@@ -117,8 +117,8 @@ class Storm:
         )
         return encode(message, (self.seq + 1) & 0xFF, self.session)
 
-    def damaged(self, kind):
-        """A frame that does not arrive whole: damage that misses all but a delimiter is done again."""
+    def corrupted(self, kind):
+        """A frame that is invalid; corruption that leaves it valid is repeated."""
         while True:
             frame = bytearray(self.random_frame())
             for _ in range(self.random.randint(1, 4)):
@@ -137,53 +137,53 @@ class Storm:
                 return bytes(frame)
 
     def repeated(self):
-        """A frame that was good once or would be in another session; counts those that the board must refuse."""
+        """A frame that was valid before, or is valid in another session; counts those that the board must refuse."""
         choice = self.random.randrange(4)
-        if choice == 0:  # the last one again, as if with other pressures
+        if choice == 0:  # the sequence number of the last one, with other pressures
             return encode(Set(self.tick, self.OTHER), self.seq, self.session)
-        self.refused += 1
+        self.refused_count += 1
         if choice == 1:  # an older one
             age = self.random.randint(1, 200)
             return encode(Set(max(0, self.tick - age), self.OTHER), (self.seq - age) & 0xFF, self.session)
-        if choice == 2:  # of the session before, and just what would come next in this one
-            ahead = self.random.randint(1, protocol.SEQUENCE_WINDOW)
-            return encode(Set(self.tick + ahead, self.OTHER), (self.seq + ahead) & 0xFF, self.session - 1)
+        if choice == 2:  # of the session before, with the next sequence number of this one
+            step = self.random.randint(1, protocol.SEQUENCE_WINDOW)
+            return encode(Set(self.tick + step, self.OTHER), (self.seq + step) & 0xFF, self.session - 1)
         return encode(Heartbeat(self.tick + 1), 0, self.session - 1)
 
     def send(self, kind, tries):
-        """`tries` damaged frames, each with a good one after it, as fast as the line takes them."""
+        """Sends `tries` corrupted frames, each followed by a valid one, at the rate of the line."""
         for done in range(0, tries, TRIES_PER_WRITE):
             block = b""
             for _ in range(min(TRIES_PER_WRITE, tries - done)):
-                self.good += 1
+                self.valid_count += 1
                 self.tick += 1
-                block += self.damaged(kind) + encode(Heartbeat(self.tick), 0, self.session)
+                block += self.corrupted(kind) + encode(Heartbeat(self.tick), 0, self.session)
             self.port.write(block)
             self.port.reset_input_buffer()
 
     def send_repeated(self, tries):
-        """`tries` frames that were good once, each with a new SET after it. A SET's answer takes twice its own time on
-        the line, so it is waited for."""
+        """Sends `tries` repeated frames, each followed by a new SET, and waits for the answer to each SET, which takes
+        twice the SET's own time on the line."""
         for _ in range(tries):
-            bad = self.repeated()
-            good = self.next_set(self.STEADY)
-            self.good += 2
-            self.port.write(bad + encode(*good, self.session))
-            while self.answer(Status).acked_seq != self.seq:
+            repeated = self.repeated()
+            valid = self.next_set(self.STEADY)
+            self.valid_count += 2
+            self.port.write(repeated + encode(*valid, self.session))
+            while self.wait_for(Status).acked_seq != self.seq:
                 pass
 
-    def judge(self):
-        """{taken, refused: beyond what they should be (mod 65536); moved: events of valves, or resets; state}."""
+    def result(self):
+        """accepted, refused: counts minus the expected ones; events: of valves and resets; state."""
         self.parser = Parser()
         status = self.status()
         return {
-            "taken": self.above(status.rx_good - self.base.rx_good, self.good - self.base_good),
-            "refused": self.above(status.rx_refused - self.base.rx_refused, self.refused),
-            "moved": [e for e in self.emulated.trace[self.since :] if e["event"] in ("pwm", "reset", "watchdog")],
+            "accepted": self.difference(status.rx_good - self.base.rx_good, self.valid_count - self.base_valid_count),
+            "refused": self.difference(status.rx_refused - self.base.rx_refused, self.refused_count),
+            "events": [e for e in self.emulated.trace[self.since :] if e["event"] in ("pwm", "reset", "watchdog")],
             "state": State(status.state),
         }
 
     @staticmethod
-    def above(counted, expected):
+    def difference(counted, expected):
         """The difference of two 16-bit counters, with its sign."""
         return (counted - expected + 0x8000) % 0x10000 - 0x8000
