@@ -81,7 +81,7 @@ class Loop:
         def prepare(left_s: float) -> float:
             if self.warm_up is None:
                 return left_s
-            return self.warm_up.before(left_s, self.frames.latest(), controller.window, controller.applied)
+            return self.warm_up.before(left_s, self.frames.latest(), controller)
 
         while True:
             tick = self.ticker.next(self._idle, prepare)

@@ -154,7 +154,7 @@ def run(options: Options) -> None:
                     log.put,
                     tally,
                     correction.by_name(options.correction, robot.modules),
-                    WarmUp(robot, controller.actuate, judge, log.put),
+                    WarmUp(robot, judge, log.put),
                 ).run(rest)
         except BaseException as raised:  # noqa: BLE001 - raised again below, after the venting
             error = raised

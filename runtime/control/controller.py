@@ -47,18 +47,21 @@ class Controller:
         actuation. desired, next_desired: desired configurations (N, 3) at the start and at the end of the step. Raises
         `ModelError` if the policy's output is not finite or far outside [-1, 1].
         """
-        kind = self._robot.kind
         if measured is not None:
-            self._state = state_of(measured, kind)
+            self._state = state_of(measured, self._robot.kind)
         self.window.observe(self._state)
         if measured is None:
             return self.applied
         self.target = self._correction.shifted(next_desired, desired, measured)
-        self.raw = self._policy.actuate(self.window.features(state_of(self.target, kind)))
-        check_actuation(self.raw)
-        actuation = limited(self.raw, self.applied, self._robot.limits.largest_actuation_step)
+        self.raw = self._output(self.target)
+        actuation = self._within_limits(self.raw)
         self._correction.record_output(self.raw, actuation)
         return actuation
+
+    def preview(self, target: Array) -> Array:
+        """The actuation (N, A) for a target configuration (N, 3) with the present window. Changes no state. Raises
+        `ModelError` as `compute` does."""
+        return self._within_limits(self._output(target))
 
     def record(self, actuation: Array) -> None:
         """Ends the step. actuation (N, A): the computed one, or the previous one if the computed one was not sent."""
@@ -70,3 +73,10 @@ class Controller:
         """Records a step without a computation: the last state is repeated, the actuation is held."""
         self.window.observe(self._state)
         self.window.applied(self.applied)
+
+    def _output(self, target: Array) -> Array:
+        return self._policy.actuate(self.window.features(state_of(target, self._robot.kind)))
+
+    def _within_limits(self, raw: Array) -> Array:
+        check_actuation(raw)
+        return limited(raw, self.applied, self._robot.limits.largest_actuation_step)

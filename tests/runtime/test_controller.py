@@ -80,3 +80,16 @@ def test_output_far_out_of_range_is_refused_and_kept_for_the_log(output):
     with pytest.raises(ModelError, match="actuation is"):
         controller.compute(REST, REST, NEXT)
     assert controller.raw is not None
+
+
+def test_a_preview_computes_the_step_and_changes_nothing():
+    policy = Policy([0.5, 1.5, -1.5])
+    controller = Controller(ROBOT, policy, REST)
+    before = repr(vars(controller)), repr(vars(controller.window))
+    np.testing.assert_array_equal(controller.preview(NEXT), [[0.5], [0.8], [-0.8]])
+    assert (repr(vars(controller)), repr(vars(controller.window))) == before
+    controller.compute(REST, REST, NEXT)
+    np.testing.assert_array_equal(policy.features[0], policy.features[1])
+    policy.output = np.full((3, 1), np.nan)
+    with pytest.raises(ModelError):
+        controller.preview(NEXT)

@@ -1,6 +1,5 @@
 """The warm-up before a control step, on virtual time: it changes no result, delays no step, and ends no run."""
 
-import copy
 import dataclasses
 
 import numpy as np
@@ -9,7 +8,8 @@ from virtual_loop import PERIOD_S, ROBOT, World, corrupting
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.clock import SPIN_S
-from modsoft.runtime.control.features import Window
+from modsoft.runtime.control.controller import Controller
+from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.log_record import WarmUpFailedRecord, encode
 from modsoft.runtime.warmup import LEAD, MARGIN, RUNS, WarmUp
@@ -25,10 +25,24 @@ class Warmed(World):
         self.runs = []
         self.run_s = RUN_S
         self.warm_answer = answer
-        self.warm_up = WarmUp(self.robot, self.rehearse, self.loop.validator, self.log, lambda: self.time_s)
+        self.in_warm_up = False
+        self.warm_up = WarmUp(self.robot, self.loop.validator, self.log, lambda: self.time_s)
+        self.warm_up.before = self.observed(self.warm_up.before)
         self.loop = dataclasses.replace(self.loop, warm_up=self.warm_up)
+        self.controller = Controller(self.robot, self, from_angles_deg(np.zeros(self.robot.modules)))
 
-    def rehearse(self, features):
+    def observed(self, before):
+        def call(*arguments):
+            self.in_warm_up = True
+            left_s = before(*arguments)
+            self.in_warm_up = False
+            return left_s
+
+        return call
+
+    def actuate(self, features):
+        if not self.in_warm_up:
+            return super().actuate(features)
         self.runs.append(self.time_s)
         self.time_s += self.run_s
         return self.warm_answer()
@@ -59,15 +73,17 @@ def test_nothing_that_is_sent_or_logged_differs():
             assert encode(getattr(one, name)) == encode(getattr(other, name)), name
 
 
-def test_it_changes_neither_the_judge_nor_the_window():
+def test_it_changes_neither_the_validator_nor_the_controller():
     world = Warmed()
-    window = Window(3, np.array([[0.0, 1.0]] * 3), 1)
-    judge_before, rows_before = copy.deepcopy(vars(world.loop.validator)), window.features(np.zeros((3, 2)))
+
+    def state():
+        return repr([vars(each) for each in (world.loop.validator, world.controller, world.controller.window)])
+
+    before = state()
     world.warm_up.step_took(0.001)
-    assert world.warm_up.before(0.003, world.frame(angles=(9.0, 9.0, 9.0)), window, np.zeros((3, 1))) == 0.0
+    assert world.warm_up.before(0.003, world.frame(angles=(9.0, 9.0, 9.0)), world.controller) == 0.0
     assert len(world.runs) == 1
-    assert repr(judge_before) == repr(vars(world.loop.validator))
-    np.testing.assert_array_equal(window.features(np.zeros((3, 2))), rows_before)
+    assert state() == before
 
 
 @pytest.mark.parametrize(
@@ -80,25 +96,22 @@ def test_without_enough_time_it_never_runs(step_s, period_s):
     table["loop"] |= {"hz": 1.0 / period_s, "task": ""}
     world = Warmed(robot=robots.from_dict(table))
     world.warm_up.step_took(step_s)
-    window, applied = Window(3, np.array([[0.0, 1.0]] * 3), 1), np.zeros((3, 1))
     for left_s in np.linspace(0.0001, period_s, 50):
-        assert world.warm_up.before(left_s, world.frame(), window, applied) == left_s
+        assert world.warm_up.before(left_s, world.frame(), world.controller) == left_s
     assert world.runs == []
 
 
 @pytest.mark.parametrize("left_s", [MARGIN * 0.001 - 1e-5, 0.0005])
-def test_a_wait_that_ended_late_leaves_it_out(left_s):
+def test_without_time_left_there_is_no_warm_up(left_s):
     world = Warmed()
     world.warm_up.step_took(0.001)
-    window = Window(3, np.array([[0.0, 1.0]] * 3), 1)
-    assert world.warm_up.before(left_s, world.frame(), window, np.zeros((3, 1))) == left_s
+    assert world.warm_up.before(left_s, world.frame(), world.controller) == left_s
     assert world.runs == []
 
 
-def test_before_the_first_step_nothing_is_known_of_the_computer():
+def test_there_is_no_warm_up_before_the_first_step():
     world = Warmed()
-    window = Window(3, np.array([[0.0, 1.0]] * 3), 1)
-    assert world.warm_up.before(0.003, world.frame(), window, np.zeros((3, 1))) == 0.003
+    assert world.warm_up.before(0.003, world.frame(), world.controller) == 0.003
     assert world.runs == []
 
 

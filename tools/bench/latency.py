@@ -196,7 +196,7 @@ def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict
                 stop,
                 log,
                 TickStatistics(robot, count),
-                warm_up=WarmUp(robot, controller.actuate, judge, log) if warm else None,
+                warm_up=WarmUp(robot, judge, log) if warm else None,
             ).run(from_angles_deg(np.zeros(modules)))
             board.close()
             reader.close()
