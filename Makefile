@@ -52,7 +52,7 @@ check: $(INSTALLED)
 coverage: $(INSTALLED)
 	.venv/bin/python tools/coverage.py
 
-# Small wrong changes of the firmware, each of which a native test has to notice.
+# Small wrong changes of the firmware, each of which a native test must detect.
 mutation: $(INSTALLED)
 	.venv/bin/python tools/mutate.py
 

@@ -23,7 +23,7 @@ static bool has_sensor(uint8_t input) { return (SENSORS >> input) & 1; }
 static void start(uint8_t input) {
   const uint8_t reference_input = _BV(MUX4) | _BV(MUX3) | _BV(MUX2) | _BV(MUX1);
   ADMUX = _BV(REFS0) | (input < INPUTS ? input : reference_input); /* full scale is the supply, 5 V */
-  ADCSRA |= _BV(ADSC);
+  ADCSRA |= _BV(ADSC); /* clears ADIF as well, because it writes back the 1 */
 }
 
 static void next(struct sensors *sensors) {
@@ -52,7 +52,7 @@ void sensors_begin(struct sensors *sensors) {
 
 bool sensors_poll(struct sensors *sensors) {
   uint16_t reading;
-  if (ADCSRA & _BV(ADSC)) {
+  if (!(ADCSRA & _BV(ADIF))) { /* never set by a converter that is off */
     return false;
   }
   reading = ADC;

@@ -20,7 +20,7 @@ struct sensors {
 
 void sensors_begin(struct sensors *sensors);
 
-/* Takes the result of the last conversion and starts the next. Returns false while the conversion still runs. */
+/* Takes the result of the last conversion and starts the next. Returns false if no conversion has ended. */
 bool sensors_poll(struct sensors *sensors);
 
 #ifdef __cplusplus

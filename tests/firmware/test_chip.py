@@ -17,7 +17,7 @@ FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
 TIMERS = {1: 0x80, 3: 0x90, 4: 0xA0, 5: 0x120}  # TCCRnA; TCCRnB, TCNTn, ICRn and OCRnA to C follow
 PORTS = {"B": 0x25, "E": 0x2E, "H": 0x102, "L": 0x10B}  # PORTx, DDRx before it
 ADCL, ADCSRA, ADCSRB, ADMUX, DIDR0, MCUSR = 0x78, 0x7A, 0x7B, 0x7C, 0x7E, 0x54
-CONVERTING = 1 << 6
+CONVERTING, COMPLETE = 1 << 6, 1 << 4
 TOP = 4095
 
 
@@ -115,8 +115,10 @@ def convert(chip, sensors, reading):
     """End one conversion; return its input."""
     source = chip.registers[ADMUX]
     chip.registers[ADCL], chip.registers[ADCL + 1] = reading & 0xFF, reading >> 8
-    chip.registers[ADCSRA] &= ~CONVERTING
+    chip.registers[ADCSRA] = chip.registers[ADCSRA] & ~CONVERTING | COMPLETE
     assert chip.code.sensors_poll(ctypes.byref(sensors))
+    assert chip.registers[ADCSRA] & COMPLETE  # writing this 1 clears the flag
+    chip.registers[ADCSRA] &= ~COMPLETE
     return source
 
 
@@ -140,8 +142,10 @@ def test_no_channel_is_measured_before_its_first_reading(chip):
     assert chip.registers[ADCSRB] == 0  # inputs 0 to 7
 
 
-def test_poll_does_not_wait_for_a_conversion(chip):
+@pytest.mark.parametrize("control", [0b1_1_000_111, 0b0_0_000_111], ids=["converting", "converter off"])
+def test_poll_without_a_completed_conversion_changes_no_reading(chip, control):
     sensors = begin(chip)
+    chip.registers[ADCSRA] = control
     before = bytes(sensors)
     assert not chip.code.sensors_poll(ctypes.byref(sensors))
     assert bytes(sensors) == before

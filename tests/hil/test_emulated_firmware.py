@@ -110,6 +110,11 @@ def test_every_check_is_found_and_together_they_feed_the_watchdog(firmware_copy:
     assert resets_without(firmware_copy, "supervisor.c", "no such line") == ["power-on"]
 
 
+def test_a_converter_that_is_off_starves_the_watchdog(firmware_copy: Path) -> None:
+    assert "_BV(ADEN) | " in (FIRMWARE / "sensors.c").read_text()
+    assert "watchdog" in resets_without(firmware_copy, "sensors.c", "_BV(ADEN) | ")
+
+
 @pytest.mark.parametrize(("name", "line"), CHECKS, ids=[re.findall(r"\w+", line)[1] for _, line in CHECKS])
 def test_a_missing_check_starves_the_watchdog(firmware_copy: Path, name: str, line: str) -> None:
     assert "watchdog" in resets_without(firmware_copy, name, line)
