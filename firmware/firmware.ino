@@ -49,8 +49,7 @@ void loop() {
   }
   if (now_ms != last_ms) {  // every byte starts a pass; the rest runs once a millisecond
     last_ms = now_ms;
-    uint8_t checks = 0;
-    checks |= take_reading();
+    uint8_t checks = take_reading();
     checks |= supervisor_update(&board, inputs.measured, inputs.supply_mv, now_ms);
     checks |= drive_pins();
     if (checks == CHECK_ALL) {

@@ -354,7 +354,7 @@ bool supervisor_receive(struct supervisor *s, uint8_t byte, uint32_t now_ms) {
 uint8_t supervisor_update(struct supervisor *s, const int16_t measured[PROTOCOL_CHANNELS], uint16_t supply_mv,
                           uint32_t now_ms) {
   uint32_t elapsed_ms = now_ms - s->now_ms;
-  uint8_t checks = 0;
+  uint8_t checks;
 
   s->now_ms = now_ms;
   memcpy(s->measured, measured, sizeof s->measured);
@@ -362,7 +362,7 @@ uint8_t supervisor_update(struct supervisor *s, const int16_t measured[PROTOCOL_
   if (s->state == STATE_BOOT) {
     s->state = STATE_IDLE;
   }
-  checks |= check_link(s, now_ms);
+  checks = check_link(s, now_ms);
   checks |= check_control(s, now_ms);
   checks |= check_sensors(s, elapsed_ms);
   checks |= drive_outputs(s, elapsed_ms);

@@ -77,13 +77,13 @@ def test_noise_on_the_line_is_counted_by_both_ends(board_name: str, drive: Any) 
 CHECKS = [
     (name, line)
     for name in ("supervisor.c", "firmware.ino")
-    for line in re.findall(r"^ +checks \|= .*;$", (FIRMWARE / name).read_text(), re.MULTILINE)
+    for line in re.findall(r"^ +(?:uint8_t )?checks \|?= \w+\(.*;$", (FIRMWARE / name).read_text(), re.MULTILINE)
 ]
 
 
 @pytest.fixture(scope="module")
 def firmware_copy(simavr: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the firmware and its objects, to be compiled with one line removed."""
+    """A folder with the firmware and its objects, to be compiled with one change."""
     emulator.build("simavr")
     folder = tmp_path_factory.mktemp("checks")
     shutil.copytree(FIRMWARE, folder / "firmware")
@@ -91,11 +91,11 @@ def firmware_copy(simavr: None, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return folder
 
 
-def resets_without(folder: Path, name: str, line: str) -> list[str]:
-    """Causes of the resets in half a second of the board's time, with `line` removed from this source file."""
+def resets_with(folder: Path, name: str, old: str, new: str) -> list[str]:
+    """Causes of the resets in half a second of the board's time, with this change of a source file."""
     source = folder / "firmware" / name
     original = source.read_text()
-    source.write_text(original.replace(line, ""))
+    source.write_text(original.replace(old, new))
     make = ("make", "-s", "-C", str(source.parent), "OUT=../built", "OURS=-w")
     subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
     source.write_text(original)
@@ -107,14 +107,14 @@ def resets_without(folder: Path, name: str, line: str) -> list[str]:
 
 def test_every_check_is_found_and_together_they_feed_the_watchdog(firmware_copy: Path) -> None:
     assert len(CHECKS) == 7
-    assert resets_without(firmware_copy, "supervisor.c", "no such line") == ["power-on"]
+    assert resets_with(firmware_copy, "supervisor.c", "", "") == ["power-on"]
 
 
 def test_a_converter_that_is_off_starves_the_watchdog(firmware_copy: Path) -> None:
     assert "_BV(ADEN) | " in (FIRMWARE / "sensors.c").read_text()
-    assert "watchdog" in resets_without(firmware_copy, "sensors.c", "_BV(ADEN) | ")
+    assert "watchdog" in resets_with(firmware_copy, "sensors.c", "_BV(ADEN) | ", "")
 
 
-@pytest.mark.parametrize(("name", "line"), CHECKS, ids=[re.findall(r"\w+", line)[1] for _, line in CHECKS])
+@pytest.mark.parametrize(("name", "line"), CHECKS, ids=[re.search(r"= (\w+)", line)[1] for _, line in CHECKS])
 def test_a_missing_check_starves_the_watchdog(firmware_copy: Path, name: str, line: str) -> None:
-    assert "watchdog" in resets_without(firmware_copy, name, line)
+    assert "watchdog" in resets_with(firmware_copy, name, line, re.sub("= .*;", "= 0;", line))
