@@ -1,4 +1,4 @@
-"""Training: it learns, it is deterministic, and a cut run ends as one that was not cut."""
+"""Training: the network learns, and an interrupted run ends with the same model as an uninterrupted one."""
 
 import dataclasses
 import math
@@ -11,12 +11,14 @@ from modsoft.runtime import robot as robots
 from modsoft.runtime.control.features import feature_names, from_angles_deg
 from modsoft.runtime.errors import InUse, ModelError, TargetNotReached, UsageError
 from modsoft.training import checkpoint as checkpoints
-from modsoft.training import train
+from modsoft.training import fit, settings, train
 from modsoft.training.data import dataset
+from modsoft.training.fit import CHECKS, PATIENCE, charbonnier_loss, estimation_errors, last_modules, one_cycle
+from modsoft.training.settings import DEVICES, PRECISIONS, Settings
 
 pytestmark = pytest.mark.instructions
 
-SMALL = train.Settings(history=3, iterations=60, batch=32, layers=2, hidden=8)
+SMALL = Settings(history=3, iterations=60, batch=32, layers=2, hidden=8)
 
 
 def make(episodes: int = 10, steps: int = 30, seed: int = 0) -> dataset.DataSet:
@@ -38,11 +40,13 @@ def equal(one: dict, other: dict) -> bool:
     return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_it_learns_and_the_checkpoint_says_all(tmp_path):
+def test_the_network_learns_and_the_checkpoint_describes_the_run(tmp_path):
     out = tmp_path / "model.pt"
     data = make(20)
-    told = []
-    train.train([data], out, dataclasses.replace(SMALL, iterations=600, learning_rate=0.01, dropout=0.0), told.append)
+    reports = []
+    train.train(
+        [data], out, dataclasses.replace(SMALL, iterations=600, learning_rate=0.01, dropout=0.0), reports.append
+    )
     assert list(tmp_path.iterdir()) == [out]
     found = checkpoints.load(out)
     assert robots.from_dict(found["robot"]) == data.robot
@@ -56,121 +60,122 @@ def test_it_learns_and_the_checkpoint_says_all(tmp_path):
     assert max(errors) < 5.0
     # and they are those of the weights in the file, on the test part
     _, _, test = dataset.split(data, 3, "blocks", 0)
-    again = train.estimation_errors(checkpoints.network_of(found), test)
+    again = estimation_errors(checkpoints.network_of(found), test)
     np.testing.assert_allclose(again.mean(dim=(0, 2)).numpy(), errors, atol=1e-3)
-    assert [t.iteration for t in told] == list(range(1, 601))
-    assert told[-1].share == 1.0
-    assert np.mean([t.loss for t in told[-50:]]) < 0.05 * told[0].loss
+    assert [t.iteration for t in reports] == list(range(1, 601))
+    assert reports[-1].progress == 1.0
+    assert np.mean([t.loss for t in reports[-50:]]) < 0.05 * reports[0].loss
 
 
-def test_the_loss_is_the_mean_error_rounded_at_zero():
+def test_loss_is_the_mean_error_and_smooth_at_zero():
     true = torch.tensor([0.5, -0.5])
-    assert train.charbonnier_loss(true, true) == pytest.approx(0.01)
-    assert train.charbonnier_loss(true + 0.3, true) == pytest.approx(0.3, rel=1e-3)
+    assert charbonnier_loss(true, true) == pytest.approx(0.01)
+    assert charbonnier_loss(true + 0.3, true) == pytest.approx(0.3, rel=1e-3)
     small = torch.tensor([1e-4], requires_grad=True)
-    train.charbonnier_loss(small, torch.zeros(1)).backward()
-    assert small.grad.item() == pytest.approx(0.01, rel=1e-3)  # not 1: it ends smoothly
+    charbonnier_loss(small, torch.zeros(1)).backward()
+    assert small.grad.item() == pytest.approx(0.01, rel=1e-3)  # not 1: smooth at zero
 
 
-def test_a_precision_that_there_is_not_is_refused():
+def test_unknown_precision_is_refused():
     with pytest.raises(UsageError, match="precision 'half', expected one of float32, bfloat16"):
         dataclasses.replace(SMALL, precision="half")
 
 
-@pytest.mark.skipif(not train.bfloat16_works("cpu"), reason="the processor has no units for bfloat16")
-def test_it_learns_as_well_with_products_of_bfloat16(tmp_path):
-    settings = dataclasses.replace(SMALL, iterations=600, learning_rate=0.01)
+@pytest.mark.skipif(not settings.bfloat16_works("cpu"), reason="the processor has no units for bfloat16")
+def test_bfloat16_products_train_as_well(tmp_path):
+    changed = dataclasses.replace(SMALL, iterations=600, learning_rate=0.01)
     errors = {}
-    for precision in train.PRECISIONS:
-        asked = dataclasses.replace(settings, precision=precision)
-        found = train.train([make(20)], tmp_path / f"{precision}.pt", asked)
-        assert {value.dtype for value in found["weights"].values()} == {torch.float32}
-        errors[precision] = np.mean(found["provenance"]["errors_percent"])
+    for precision in PRECISIONS:
+        checkpoint = train.train(
+            [make(20)], tmp_path / f"{precision}.pt", dataclasses.replace(changed, precision=precision)
+        )
+        assert {value.dtype for value in checkpoint["weights"].values()} == {torch.float32}
+        errors[precision] = np.mean(checkpoint["provenance"]["errors_percent"])
     assert 0.0 < abs(errors["bfloat16"] - errors["float32"]) < 1.0
     assert max(errors.values()) < 5.0
 
 
-def test_a_precision_or_device_that_the_machine_does_not_have_is_refused(monkeypatch, tmp_path):
-    monkeypatch.setattr(train, "bfloat16_works", lambda device: False)
+def test_precision_or_device_that_the_machine_does_not_have_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setattr(settings, "bfloat16_works", lambda device: False)
     with pytest.raises(UsageError, match="precision bfloat16: this machine has no units for it; give --precision"):
-        train.settings_for("cable", {"precision": "bfloat16"})
-    assert train.fastest_precision() == "float32"
+        settings.settings_for("cable", {"precision": "bfloat16"})
+    assert settings.fastest_precision() == "float32"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UsageError, match="device cuda: torch finds no GPU"):
         train.train([make()], tmp_path / "model.pt", dataclasses.replace(SMALL, device="cuda"))
     assert not list(tmp_path.iterdir())
 
 
-def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
+def test_default_device_is_the_gpu_where_there_is_one(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert train.settings_for("cable", {"device": "auto", "learning_rate": None}) == train.Settings(5, batch=64)
+    assert settings.settings_for("cable", {"device": "auto", "learning_rate": None}) == Settings(5, batch=64)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    found = train.settings_for("pneumatic", {"device": "auto"})
+    found = settings.settings_for("pneumatic", {"device": "auto"})
     assert (found.device, found.batch, found.truncation_probability) == ("cuda", 512, 0.4)
-    found = train.settings_for("pneumatic", {"device": "cpu", "network": "lstm", "history": 7})
+    found = settings.settings_for("pneumatic", {"device": "cpu", "network": "lstm", "history": 7})
     assert (found.device, found.batch, found.truncation_probability, found.history) == ("cpu", 128, 0.0, 7)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-def test_a_gpu_gives_the_same_model_within_rounding(tmp_path):
+def test_gpu_gives_the_same_model_within_rounding(tmp_path):
     found = {}
-    for device in train.DEVICES:
-        settings = dataclasses.replace(SMALL, device=device, iterations=100, learning_rate=0.01)
-        found[device] = train.train([make(20)], tmp_path / f"{device}.pt", settings)["weights"]
+    for device in DEVICES:
+        changed = dataclasses.replace(SMALL, device=device, iterations=100, learning_rate=0.01)
+        found[device] = train.train([make(20)], tmp_path / f"{device}.pt", changed)["weights"]
         assert {value.device.type for value in found[device].values()} == {"cpu"}
     for name, value in found["cpu"].items():
         torch.testing.assert_close(found["cuda"][name], value, atol=0.01, rtol=0.01)
 
 
-def test_a_run_ends_as_soon_as_its_target_is_reached(tmp_path):
+def test_run_ends_as_soon_as_its_target_is_reached(tmp_path):
     steps = []
-    settings = dataclasses.replace(SMALL, iterations=600, learning_rate=0.01, target_percent=10.0)
-    found = train.train([make(20)], tmp_path / "model.pt", settings, steps.append)["provenance"]
+    changed = dataclasses.replace(SMALL, iterations=600, learning_rate=0.01, target_percent=10.0)
+    found = train.train([make(20)], tmp_path / "model.pt", changed, steps.append)["provenance"]
     assert found["validation_percent"] <= 10.0
     assert found["iterations_done"] == len(steps) < 600
     assert steps[-1].validation_percent > 10.0, "the check after that step is the first that reaches it"
 
 
-def test_a_run_that_misses_its_target_keeps_its_model_and_says_so_each_time(tmp_path):
+def test_run_above_its_target_keeps_the_model_and_is_reported_every_time(tmp_path):
     out = tmp_path / "model.pt"
-    settings = dataclasses.replace(SMALL, target_percent=0.01)
+    changed = dataclasses.replace(SMALL, target_percent=0.01)
     for _ in range(2):
         with pytest.raises(TargetNotReached, match=r"validation error .* % after 60 iterations .* at most 0.01 %"):
-            train.train([make()], out, settings)
+            train.train([make()], out, changed)
         assert list(tmp_path.iterdir()) == [out]
         assert checkpoints.load(out)["provenance"]["iterations_done"] == 60
 
 
-def test_a_cut_run_of_another_optimizer_is_refused(tmp_path, monkeypatch):
+def test_interrupted_run_of_another_optimizer_is_refused(tmp_path, monkeypatch):
     out = tmp_path / "model.pt"
     with pytest.raises(Cut):
         train.train([make()], out, SMALL, cut_at(7))
     monkeypatch.setattr(train.optimizer, "DESCRIPTION", "another")
-    with pytest.raises(ModelError, match=r"model.pt.resume: of a run with optimizer muon.*, asked for another"):
+    with pytest.raises(ModelError, match=r"model.pt.resume: of a run with optimizer muon.*, expected another"):
         train.train([make()], out, SMALL)
 
 
 @pytest.mark.parametrize("network", ["lstm", "module-lstm"])
-def test_the_networks_bound_to_a_module_number_learn_too(tmp_path, network):
+def test_networks_bound_to_a_module_number_learn(tmp_path, network):
     data = make(20)
-    settings = dataclasses.replace(SMALL, network=network, iterations=600, learning_rate=0.01, dropout=0.0)
-    found = train.train([data], tmp_path / "model.pt", settings)
+    changed = dataclasses.replace(SMALL, network=network, iterations=600, learning_rate=0.01, dropout=0.0)
+    found = train.train([data], tmp_path / "model.pt", changed)
     assert (found["network"]["name"], found["network"]["modules"]) == (network, 3)
     assert found["provenance"]["network"] == network
-    # 25 percent is a guess. A module's own angle hides up to 10 of 40 degrees of its neighbour's doing.
+    # A guess has 25 percent. A module's own angle does not show the up to 10 of 40 degrees from its neighbour.
     assert max(found["provenance"]["errors_percent"]) < (5.0 if network == "lstm" else 15.0)
     again = checkpoints.network_of(checkpoints.load(tmp_path / "model.pt"))
     _, _, test = dataset.split(data, 3, "blocks", 0)
-    errors = train.estimation_errors(again, test).mean(dim=(0, 2))
+    errors = estimation_errors(again, test).mean(dim=(0, 2))
     np.testing.assert_allclose(errors.numpy(), found["provenance"]["errors_percent"], atol=1e-3)
 
 
-def test_a_network_bound_to_a_module_number_has_no_shorter_robots():
+def test_network_bound_to_a_module_number_refuses_truncation():
     with pytest.raises(UsageError, match=r"--truncation-probability 0\.4: the network lstm is bound"):
         dataclasses.replace(SMALL, network="lstm", truncation_probability=0.4)
 
 
-def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
+def test_weights_depend_on_the_seed_alone(tmp_path):
     one, again, other = (
         train.train([make()], tmp_path / f"{number}.pt", dataclasses.replace(SMALL, seed=seed))["weights"]
         for number, seed in enumerate((0, 0, 1))
@@ -179,29 +184,29 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not(tmp_path):
     assert not equal(one, other)
 
 
-def test_a_finished_model_is_kept_and_of_another_run_refused(tmp_path):
+def test_finished_model_is_kept_and_one_of_other_settings_refused(tmp_path):
     out = tmp_path / "model.pt"
-    made, told = train.train([make()], out, SMALL), []
+    made, reports = train.train([make()], out, SMALL), []
     before, other = out.read_bytes(), tmp_path / "model.pt.resume"
     other.write_text("not of this training")
-    again = train.train([make()], out, SMALL, told.append)
+    again = train.train([make()], out, SMALL, reports.append)
     assert other.read_text() == "not of this training"
     assert equal(again["weights"], made["weights"])
-    assert not told
-    with pytest.raises(ModelError, match=r"there already, made with batch 32, asked for 64; give another --out"):
+    assert not reports
+    with pytest.raises(ModelError, match=r"exists already, with batch 32, expected 64; give another --out"):
         train.train([make()], out, dataclasses.replace(SMALL, batch=64))
     assert out.read_bytes() == before
 
 
 @pytest.mark.parametrize("error", [math.nan, 1e9])
-def test_a_run_that_diverged_leaves_nothing_to_go_on_from(tmp_path, monkeypatch, error):
-    monkeypatch.setattr(train, "estimation_errors", lambda *_: torch.tensor(error))
+def test_diverged_run_leaves_no_file(tmp_path, monkeypatch, error):
+    monkeypatch.setattr(fit, "estimation_errors", lambda *_: torch.tensor(error))
     with pytest.raises(ModelError, match="diverged"):
         train.train([make()], tmp_path / "model.pt", SMALL)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_second_training_of_the_same_model_is_refused_and_changes_nothing(tmp_path):
+def test_second_training_of_the_same_model_is_refused_and_changes_nothing(tmp_path):
     out, refused = tmp_path / "model.pt", []
 
     def second(now):
@@ -216,7 +221,7 @@ def test_a_second_training_of_the_same_model_is_refused_and_changes_nothing(tmp_
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_through_a_link_everything_goes_to_its_target(tmp_path):
+def test_all_files_are_written_beside_the_target_of_a_link(tmp_path):
     home, disk = tmp_path / "home", tmp_path / "disk"
     home.mkdir()
     disk.mkdir()
@@ -230,30 +235,30 @@ def test_through_a_link_everything_goes_to_its_target(tmp_path):
 
 
 class Cut(Exception):
-    """Stands for a kill: nothing of the run is told that it comes."""
+    """Stands for a kill, which the run cannot handle."""
 
 
 def cut_at(iteration: int):
-    def cut(told):
-        if told.iteration == iteration:
+    def cut(progress):
+        if progress.iteration == iteration:
             raise Cut
 
     return cut
 
 
 @pytest.mark.parametrize("iteration", [4, 21, 59])
-def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, iteration):
-    settings = dataclasses.replace(SMALL, truncation_probability=0.3)
-    straight = train.train([make()], tmp_path / "straight.pt", settings)
+def test_interrupted_run_ends_with_the_same_weights_bit_for_bit(tmp_path, iteration):
+    changed = dataclasses.replace(SMALL, truncation_probability=0.3)
+    straight = train.train([make()], tmp_path / "straight.pt", changed)
     out = tmp_path / "cut.pt"
     with pytest.raises(Cut):
-        train.train([make()], out, settings, cut_at(iteration))
+        train.train([make()], out, changed, cut_at(iteration))
     assert not out.exists()
     torch.manual_seed(123)  # a new process has another random state
     resumed = []
-    found = train.train([make()], out, settings, resumed.append)
-    # From the last check: the work since then was lost, and no more.
-    every = settings.iterations // train.CHECKS
+    found = train.train([make()], out, changed, resumed.append)
+    # From the last check: only the work since then is lost.
+    every = changed.iterations // CHECKS
     assert resumed[0].iteration == (iteration - 1) // every * every + 1
     assert equal(found["weights"], straight["weights"])
     assert found["provenance"]["errors_percent"] == straight["provenance"]["errors_percent"]
@@ -261,9 +266,17 @@ def test_a_cut_run_ends_with_the_same_weights_bit_for_bit(tmp_path, iteration):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"identity": 1}, {"weights": {}}, {"weights": 1}, {"optimiser": {}}, {"worse": "x"}, {"iteration": -1}]
+    "changes",
+    [
+        {"identity": 1},
+        {"weights": {}},
+        {"weights": 1},
+        {"optimizer": {}},
+        {"checks_without_improvement": "x"},
+        {"iteration": -1},
+    ],
 )
-def test_a_state_that_is_none_of_this_training_is_one_line(tmp_path, changes):
+def test_damaged_state_is_one_line(tmp_path, changes):
     out = tmp_path / "model.pt"
     with pytest.raises(Cut):
         train.train([make()], out, SMALL, cut_at(21))
@@ -276,11 +289,11 @@ def test_a_state_that_is_none_of_this_training_is_one_line(tmp_path, changes):
     assert not out.exists()
 
 
-def test_a_cut_run_of_other_settings_or_data_is_refused(tmp_path):
+def test_interrupted_run_of_other_settings_or_data_is_refused(tmp_path):
     out = tmp_path / "model.pt"
     with pytest.raises(Cut):
         train.train([make()], out, SMALL, cut_at(7))
-    with pytest.raises(ModelError, match=r"model.pt.resume: of a run with batch 32, asked for 64"):
+    with pytest.raises(ModelError, match=r"model.pt.resume: of a run with batch 32, expected 64"):
         train.train([make()], out, dataclasses.replace(SMALL, batch=64))
     with pytest.raises(ModelError, match="of a run with data_sha256"):
         train.train([make(seed=1)], out, SMALL)
@@ -290,53 +303,53 @@ def test_a_cut_run_of_other_settings_or_data_is_refused(tmp_path):
         train.train([make()], out, SMALL)
 
 
-def test_it_stops_early_and_keeps_the_best_weights(tmp_path):
-    """Targets without any rule: the validation error only gets worse as the network learns them by heart."""
+def test_early_stopping_keeps_the_best_weights(tmp_path):
+    """Random targets: the validation error increases as the network memorises them."""
     data = make()
     data.action[:] = np.random.default_rng(5).uniform(-1, 1, data.action.shape)
-    told = []
-    settings = dataclasses.replace(SMALL, iterations=4000, learning_rate=0.02, hidden=32, dropout=0.0)
-    found = train.train([data], tmp_path / "model.pt", settings, told.append)
+    reports = []
+    changed = dataclasses.replace(SMALL, iterations=4000, learning_rate=0.02, hidden=32, dropout=0.0)
+    found = train.train([data], tmp_path / "model.pt", changed, reports.append)
     best = found["provenance"]["validation_percent"]
-    first_with_best = next(t.iteration for t in told if t.validation_percent == best)
-    every = settings.iterations // train.CHECKS
-    assert found["provenance"]["iterations_done"] == first_with_best - 1 + train.PATIENCE * every < 4000
+    first_with_best = next(t.iteration for t in reports if t.validation_percent == best)
+    every = changed.iterations // CHECKS
+    assert found["provenance"]["iterations_done"] == first_with_best - 1 + PATIENCE * every < 4000
     _, validation, _ = dataset.split(data, 3, "blocks", 0)
-    again = float(train.estimation_errors(checkpoints.network_of(found), validation).mean())
+    again = float(estimation_errors(checkpoints.network_of(found), validation).mean())
     assert again == pytest.approx(best, abs=1e-4)
 
 
-def test_the_last_modules_are_labelled_as_a_robot_of_their_own():
+def test_last_modules_get_the_labels_of_a_robot_of_that_many():
     training, _, _ = dataset.split(make(), 3, "blocks", 0)
     features = torch.from_numpy(training.features)
-    two = train.last_modules(features, 2)
+    two = last_modules(features, 2)
     assert torch.equal(two[..., :-1], features[:, 1:, :-1])
     assert two[0, :, -1].tolist() == [-1.0, 1.0]
-    assert torch.equal(train.last_modules(features, 3), features)
+    assert torch.equal(last_modules(features, 3), features)
 
 
-def test_a_budget_of_minutes_ends_the_run_with_its_learning_rate_at_nothing(tmp_path):
-    now = iter(np.arange(0.0, 1e6, 0.5))  # every look at the clock takes half a second
-    told = []
-    settings = dataclasses.replace(SMALL, iterations=100000, minutes=0.5)
-    found = train.train([make()], tmp_path / "model.pt", settings, told.append, clock=lambda: float(next(now)))
+def test_time_budget_ends_the_run_at_progress_1(tmp_path):
+    now = iter(np.arange(0.0, 1e6, 0.5))  # every reading of the clock takes half a second
+    reports = []
+    changed = dataclasses.replace(SMALL, iterations=100000, minutes=0.5)
+    found = train.train([make()], tmp_path / "model.pt", changed, reports.append, clock=lambda: float(next(now)))
     assert found["provenance"]["seconds"] == pytest.approx(30, abs=2)
-    assert told[-1].share >= 1.0
+    assert reports[-1].progress >= 1.0
     assert found["provenance"]["iterations_done"] < 100
 
 
-def test_the_learning_rate_is_one_cycle():
-    shares = np.linspace(0, 1, 1001)
-    rates = np.array([train.one_cycle(share, 0.003) for share in shares])
+def test_learning_rate_is_one_cycle():
+    progress = np.linspace(0, 1, 1001)
+    rates = np.array([one_cycle(each, 0.003) for each in progress])
     assert rates[0] == pytest.approx(0.003 * 0.04)
     assert rates[-1] == pytest.approx(0.0, abs=1e-9)
-    assert shares[rates.argmax()] == pytest.approx(0.3)
+    assert progress[rates.argmax()] == pytest.approx(0.3)
     assert rates.max() == pytest.approx(0.003)
     assert np.all(np.diff(rates[:301]) > 0)
     assert np.all(np.diff(rates[300:]) < 0)
 
 
-def test_several_data_sets_of_one_robot_are_learned_together(tmp_path):
+def test_several_data_sets_of_one_robot_train_one_model(tmp_path):
     data = [make(), make(5, seed=1)]
     found = train.train(data, tmp_path / "model.pt", SMALL)["provenance"]
     alone = [train.train([each], tmp_path / f"{i}.pt", SMALL)["provenance"] for i, each in enumerate(data)]
@@ -355,7 +368,7 @@ def test_data_sets_of_different_robots_are_refused(tmp_path):
         train.train([make(), other], tmp_path / "model.pt", SMALL)
 
 
-def test_a_look_at_the_validation_error_takes_so_many_windows_at_most():
+def test_evenly_spread_windows_are_at_most_the_number_given():
     windows = dataset.Windows(np.arange(100, dtype=np.float32)[:, None, None], np.zeros((100, 1, 1), np.float32))
     assert len(windows.evenly(100)) == 100
     found = windows.evenly(30).features[:, 0, 0]

@@ -1,4 +1,4 @@
-"""modsoft-train as a command, killed for real."""
+"""The command modsoft-train, killed in the middle of a run, and with mistakes in its arguments."""
 
 import os
 import subprocess
@@ -45,18 +45,19 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_killed_and_started_again_it_ends_with_the_same_model(folder):
+def test_killed_run_resumes_and_ends_with_the_same_model(folder):
     straight = run(folder, "d.h5", "--out", "straight.pt", *QUICK)
     assert straight.returncode == 0, straight.stderr
-    assert "module 2: actuation estimated within" in straight.stdout
-    said = checkpoints.load(folder / "straight.pt")["provenance"]
-    assert (said["history"], said["batch"], said["truncation_probability"], said["split"]) == (3, 8, 0.4, "blocks")
+    assert "module 2: actuation estimation error" in straight.stdout
+    provenance = checkpoints.load(folder / "straight.pt")["provenance"]
+    expected = {"history": 3, "batch": 8, "truncation_probability": 0.4, "split": "blocks"}
+    assert expected.items() <= provenance.items()
     victim = subprocess.Popen(command(folder, "d.h5", "--out", "m.pt", *QUICK), cwd=folder, stderr=subprocess.DEVNULL)
     resume = folder / "m.pt.resume"
-    patience = time.monotonic() + 60
+    deadline_s = time.monotonic() + 60
     while not resume.exists():
         assert victim.poll() is None
-        assert time.monotonic() < patience
+        assert time.monotonic() < deadline_s
     victim.kill()
     victim.wait()
     assert not (folder / "m.pt").exists()
@@ -66,11 +67,11 @@ def test_killed_and_started_again_it_ends_with_the_same_model(folder):
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert not resume.exists()
     finished = run(folder, "d.h5", "--out", "m.pt", *QUICK)
-    assert "m.pt: there already, " in finished.stdout
-    assert finished.stderr == "", "nothing to wait for, so no bar"
+    assert "m.pt: exists already, " in finished.stdout
+    assert finished.stderr == "", "no progress bar"
 
 
-def test_the_network_asked_for_is_trained(folder):
+def test_network_option_selects_the_network(folder):
     found = run(folder, "d.h5", "--out", "m.pt", "--network", "lstm", *QUICK)
     assert found.returncode == 0, found.stderr
     made = checkpoints.load(folder / "m.pt")
@@ -80,7 +81,7 @@ def test_the_network_asked_for_is_trained(folder):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["none.h5"], 65, "no data set none.h5"),
         (["bad.h5"], 65, "bad.h5: not a data set"),
@@ -99,17 +100,17 @@ def test_the_network_asked_for_is_trained(folder):
         ([], 2, "DATASET"),
     ],
 )
-def test_mistakes_end_in_one_clear_line(folder, arguments, code, said):
+def test_mistakes_end_in_one_clear_line(folder, arguments, code, message):
     (folder / "bad.h5").write_bytes(b"no")
     found = run(folder, *arguments)
     assert (found.returncode, found.stdout) == (code, "")
-    assert said in found.stderr
+    assert message in found.stderr
     assert "Traceback" not in found.stderr
     if code not in (2, 77):  # a usage line, or the progress bar, comes before it
         assert found.stderr.count("\n") == 1
 
 
-def test_bfloat16_is_refused_in_one_line_where_the_processor_may_not_use_it(folder):
+def test_bfloat16_without_units_for_it_is_refused_in_one_line(folder):
     limited = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2"}
     found = run(folder, "d.h5", "--precision", "bfloat16", **limited)
     assert (found.returncode, found.stdout) == (2, "")
@@ -119,7 +120,7 @@ def test_bfloat16_is_refused_in_one_line_where_the_processor_may_not_use_it(fold
     assert [path.name for path in folder.iterdir()] == ["d.h5"]
 
 
-def test_help_comes_without_torch(folder):
+def test_help_does_not_import_torch(folder):
     code = "import sys; from modsoft.training import train_cli; assert 'torch' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code], cwd=folder, check=False).returncode == 0
     found = run(folder, "--help")

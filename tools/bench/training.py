@@ -42,7 +42,9 @@ from modsoft.runtime.entry_point import entry
 from modsoft.training import networks, optimizer, train
 from modsoft.training.data import collect, dataset
 from modsoft.training.data.dataset import DataSet, Windows
+from modsoft.training.fit import estimation_errors
 from modsoft.training.networks import BiLSTM
+from modsoft.training.settings import BY_KIND, Settings
 
 TABLE_1_PERCENT = (1.63, 1.49, 1.11, 0.70)  # biLSTM, modules 1 to 4
 ROOT = Path(__file__).resolve().parents[2]
@@ -121,8 +123,8 @@ def adam(race: Race, data: DataSet) -> None:
 
 def ours(race: Race, data: DataSet) -> None:
     """modsoft-train without its command line."""
-    settings = train.Settings(
-        **train.BY_KIND[data.robot.kind] | {"split": "shuffled", "batch": race.batch},
+    settings = Settings(
+        **BY_KIND[data.robot.kind] | {"split": "shuffled", "batch": race.batch},
         iterations=race.iterations,
         layers=race.layers,
         hidden=race.hidden,
@@ -152,7 +154,7 @@ def authors(race: Race, data: DataSet) -> None:
     """The training of the paper, until someone ends it."""
     torch.set_num_threads(1)
     torch.manual_seed(race.seed)
-    history = train.BY_KIND[data.robot.kind]["history"]
+    history = BY_KIND[data.robot.kind]["history"]
     training, validation, _ = dataset.split(data, history, "shuffled", race.seed)
     network = BiLSTM(training.features.shape[-1], training.targets.shape[-1], race.layers, race.hidden, dropout=0.1)
     optimiser = torch.optim.Adam(network.parameters(), lr=0.001)
@@ -167,7 +169,7 @@ def authors(race: Race, data: DataSet) -> None:
         loss.backward()
         optimiser.step()
         if iteration % race.authors_check == 0:
-            percent = min(percent, float(train.estimation_errors(network, validation).mean()))
+            percent = min(percent, float(estimation_errors(network, validation).mean()))
         turns.tell(iteration, percent)
 
 
@@ -180,7 +182,7 @@ def step_times(rounds: int) -> list[dict[str, Any]]:
     rows = []
     for batch, name, wanted in STEPS:
         robot = robots.load(name)
-        history = train.BY_KIND[robot.kind]["history"]
+        history = BY_KIND[robot.kind]["history"]
         sizes = {"feature_size": history * (robot.state_size + robot.action_size) + 1, "action_size": robot.action_size}
         network = networks.build({"name": "bilstm", "layers": 4, "hidden": 128, **sizes})
         both, features = optimizer.MuonAndAdam(network), torch.randn(batch, robot.modules, sizes["feature_size"])

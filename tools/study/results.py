@@ -56,7 +56,7 @@ def record(quantity: str, **fields: Any) -> Record:
 
 
 class Settings(msgspec.Struct):
-    """How a model was trained; the fields are those of `modsoft.training.train.Settings`."""
+    """How a model was trained; the fields are those of `modsoft.training.settings.Settings`."""
 
     network: str
     layers: int

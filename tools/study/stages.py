@@ -22,9 +22,10 @@ from modsoft.study.paths import NOT_READABLE, Folder
 from modsoft.study.plan import Data, Model, Plan
 from modsoft.study.scheduler import AddProgress, Stage
 from modsoft.training import checkpoint as checkpoints
-from modsoft.training import train
+from modsoft.training import fit, train
 from modsoft.training.data import dataset
 from modsoft.training.data.collect import collect
+from modsoft.training.settings import BY_KIND, Settings, fastest_precision
 from modsoft.training.simulation import simulators
 
 # Estimates for the remaining time: windows trained (batch 128) and samples simulated in a second of one core.
@@ -67,22 +68,22 @@ def train_s(plan: Plan, folder: Folder, model: Model) -> float:
     return settings.iterations * settings.batch / WINDOWS_PER_S[model.network]
 
 
-def settings_of(plan: Plan, model: Model) -> train.Settings:
+def settings_of(plan: Plan, model: Model) -> Settings:
     """The settings that a model is trained with: the plan's, else those of the kind of robot."""
     of_plan = plan.settings.get((model.network, model.data), {})
     of_model = {"network": model.network, "split": model.split, "seed": model.seed}
-    precision = {"precision": train.fastest_precision()}
-    return train.Settings(**train.BY_KIND["cable"] | of_model | precision | of_plan)
+    precision = {"precision": fastest_precision()}
+    return Settings(**BY_KIND["cable"] | of_model | precision | of_plan)
 
 
 def _train(plan: Plan, folder: Folder, model: Model, add_progress: AddProgress) -> None:
     before = None
 
-    def progress(now: train.Progress) -> None:
+    def progress(now: fit.Progress) -> None:
         nonlocal before
         if before is not None:  # the iterations of an earlier, killed run do not count
-            add_progress(now.share - before)
-        before = now.share
+            add_progress(now.progress - before)
+        before = now.progress
 
     data = [dataset.read(folder.data(name)) for name in plan.mixes[model.data]]
     train.train(data, folder.checkpoint(model), settings_of(plan, model), progress)
@@ -130,7 +131,7 @@ def _estimate(plan: Plan, folder: Folder, model: Model, add_progress: AddProgres
     if model.data == "paper" and provenance["data_sha256"] != data.sha256():
         raise ModelError(f"{folder.checkpoint(model)}: trained on other data than {folder.data(name)}; delete one")
     _, _, test = dataset.split(data, checkpoint["network"]["history"], model.split, model.seed)
-    errors = train.estimation_errors(checkpoints.network_of(checkpoint), test).numpy()
+    errors = fit.estimation_errors(checkpoints.network_of(checkpoint), test).numpy()
     with written(folder.estimate(model)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, error_percent=errors)
 
