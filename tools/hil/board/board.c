@@ -13,9 +13,9 @@
  *   reset | power-cycle                       reset pin; power off and on (RAM lost)
  *   hang [cli]                                the main loop stops until a reset; cli: interrupts are off too
  *   unplug | plug [PATH]                      pull the USB cable (the board keeps its power); back in, under a new name
- *   corrupt-rx|drop-rx|insert-rx P [SEED]     line noise towards the board, probability of each byte
- *   corrupt-tx|drop-tx P [SEED]               line noise towards the host
- *   flood MS | seed N                         random bytes at line rate towards the board; seed of the noise
+ *   corrupt-rx|drop-rx|insert-rx P [SEED]     serial noise towards the board, probability of each byte
+ *   corrupt-tx|drop-tx P [SEED]               serial noise towards the host
+ *   flood MS | seed N                         random bytes at the port's rate towards the board; seed of the noise
  *   run US BYTES                              --stepped: advance by US microseconds once the host has sent BYTES bytes
  *                                             in total; answered by `ran`
  *   stats | quit

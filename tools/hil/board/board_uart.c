@@ -50,13 +50,13 @@ static avr_cycle_count_t on_rx_byte(avr_t *chip, avr_cycle_count_t when, void *p
       rx_shift = rx_now;
     }
   }
-  rx_now = line_next_byte(listening_baud());
+  rx_now = pty_next_byte(listening_baud());
   if (rx_now < 0) {
     return 0;
   }
-  rx_end = when + line_byte_ticks();
+  rx_end = when + pty_byte_ticks();
   if (rx_shift >= 0) { /* a new start bit while the shift register is still full */
-    line_counters.rx_overrun++;
+    pty_counters.rx_overrun++;
     rx_shift = -1;
   }
   return rx_end;
@@ -64,7 +64,7 @@ static avr_cycle_count_t on_rx_byte(avr_t *chip, avr_cycle_count_t when, void *p
 
 static uint8_t on_udr_read(avr_t *chip, avr_io_addr_t address, void *param) {
   (void)param;
-  uart->rx_cnt = 0; /* disables simavr's limit of the reading rate: bytes arrive at line rate */
+  uart->rx_cnt = 0; /* disables simavr's limit of the reading rate: bytes arrive at the port's rate */
   uint8_t value = chip_udr.read(chip, address, chip_udr.param);
   if (rx_shift >= 0) {
     rx_store((uint8_t)rx_shift);
@@ -91,7 +91,7 @@ static void on_uart_output(avr_irq_t *irq, uint32_t value, void *param) {
   }
   avr_cycle_timer_register(avr, tx_free - avr->cycle + 2, on_tx_room, NULL); /* after simavr's own timer */
   tx_free += uart->cycles_per_byte;
-  line_send(tx_free, (uint8_t)value, board_baud());
+  pty_send(tx_free, (uint8_t)value, board_baud());
 }
 
 static void on_ucsrb_write(avr_t *chip, avr_io_addr_t address, uint8_t value, void *param) {
@@ -112,16 +112,16 @@ void uart_start_byte(void) {
   if (rx_now >= 0) {
     return;
   }
-  rx_now = line_next_byte(listening_baud());
-  rx_end = avr->cycle + (rx_now < 0 ? 0 : line_byte_ticks());
+  rx_now = pty_next_byte(listening_baud());
+  rx_end = avr->cycle + (rx_now < 0 ? 0 : pty_byte_ticks());
   if (rx_now >= 0) {
-    avr_cycle_timer_register(avr, line_byte_ticks(), on_rx_byte, NULL);
+    avr_cycle_timer_register(avr, pty_byte_ticks(), on_rx_byte, NULL);
   }
 }
 
 void uart_ignore_bytes(void) {
   while (rx_end <= avr->cycle) {
-    rx_end = line_next_byte(0) < 0 ? avr->cycle + 1 : rx_end + line_byte_ticks();
+    rx_end = pty_next_byte(0) < 0 ? avr->cycle + 1 : rx_end + pty_byte_ticks();
   }
 }
 

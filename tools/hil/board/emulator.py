@@ -51,7 +51,7 @@ DEBIAN_PACKAGES = {
     str(BOOTLOADER): "arduino-core-avr",
 }
 _NEEDS: dict[BoardName, tuple[str, ...]] = {"simavr": tuple(DEBIAN_PACKAGES), "native": ("gcc",)}
-_COMMON = ("harness.c", "events.c", "line.c", "sensors.c")
+_COMMON = ("harness.c", "events.c", "pty.c", "sensors.c")
 _BOARD_SOURCES: dict[BoardName, tuple[Path, ...]] = {
     "simavr": tuple(SOURCES / name for name in (*_COMMON, "board.c", "board_outputs.c", "board_uart.c")),
     "native": (

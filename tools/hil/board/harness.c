@@ -56,7 +56,7 @@ static void report_statistics(const char *name) {
   double cpu_s =
       usage.ru_utime.tv_sec + usage.ru_stime.tv_sec + 1e-6 * (usage.ru_utime.tv_usec + usage.ru_stime.tv_usec);
   double wall_s = 1e-9 * (events_mono_ns() - started_ns), emulated_s = (double)board_now() / TICKS_PER_SECOND;
-  struct line_counters *c = &line_counters;
+  struct pty_counters *c = &pty_counters;
   events_emit(
       name,
       "\"emulated_s\":%.6f,\"wall_s\":%.6f,\"cpu_s\":%.3f,\"percent_of_real_time\":%.3f,\"percent_of_core\":%.2f,"
@@ -95,11 +95,11 @@ static bool run_command(char *line) {
   } else if (!strcmp(verb, "hang")) {
     known = board_hang(!strcmp(rest, "cli"));
   } else if (!strcmp(verb, "unplug")) {
-    line_unplug();
+    pty_unplug();
   } else if (!strcmp(verb, "plug")) {
-    line_plug(rest);
+    pty_plug(rest);
   } else if (!strcmp(verb, "flood") && numbers == 1) {
-    line_flood((ticks_t)(a * 1000 * TICKS_PER_US));
+    pty_flood((ticks_t)(a * 1000 * TICKS_PER_US));
   } else if (!strcmp(verb, "seed") && numbers == 1) {
     random_state = 0x9E3779B97F4A7C15u ^ (uint64_t)a << 20;
   } else if (!strcmp(verb, "stats")) {
@@ -110,7 +110,7 @@ static bool run_command(char *line) {
     run_reported = false;
     return true; /* a host sends hundreds a second: no event until it ends */
   } else {
-    known = numbers >= 1 && a >= 0 && a <= 1 && line_command(verb, a);
+    known = numbers >= 1 && a >= 0 && a <= 1 && pty_command(verb, a);
     if (known && numbers >= 2) {
       random_state = 0x9E3779B97F4A7C15u ^ (uint64_t)b << 20;
     }
@@ -175,17 +175,17 @@ static void pace(uint64_t *base_ns, ticks_t slice_end) {
 static void await_step(void) {
   while (board_now() >= run_until && !stop_signal) {
     if (!run_reported) {
-      events_emit("ran", "\"from_host\":%llu,\"to_host\":%llu", (unsigned long long)line_counters.from_host,
-                  (unsigned long long)line_counters.to_host);
+      events_emit("ran", "\"from_host\":%llu,\"to_host\":%llu", (unsigned long long)pty_counters.from_host,
+                  (unsigned long long)pty_counters.to_host);
     }
     run_reported = true;
     events_flush(true);
     read_commands(1000);
   }
-  line_poll();
-  for (int tries = 0; line_counters.from_host < run_from_host && line_is_open() && tries < STEP_TRIES; tries++) {
+  pty_poll();
+  for (int tries = 0; pty_counters.from_host < run_from_host && pty_is_open() && tries < STEP_TRIES; tries++) {
     usleep(STEP_WAIT_US);
-    line_poll();
+    pty_poll();
   }
 }
 
@@ -235,7 +235,7 @@ static void report_ready(const struct options *options) {
               options->stepped ? "emulated, step by step"
               : options->fast  ? "emulated, not held to real time"
                                : "emulated, held to real time",
-              line_port(), board_channels, options->bootloader ? "true" : "false", (int)getpid(),
+              pty_port(), board_channels, options->bootloader ? "true" : "false", (int)getpid(),
               (double)P_FULL / UNITS_PER_BAR, (unsigned)SENSORS, SENSOR_MV_PER_UNIT * UNITS_PER_BAR);
 }
 
@@ -254,11 +254,11 @@ static void run_slice(const struct options *options, uint64_t *base_ns) {
   if (!options->stepped) {
     read_commands(0);
   }
-  line_poll();
+  pty_poll();
   ticks_t before = board_now();
   board_run(slice_end);
   sensors_advance((double)(board_now() - before) / TICKS_PER_US);
-  line_flush(board_now());
+  pty_flush(board_now());
   events_flush(false);
 }
 
@@ -272,7 +272,7 @@ int main(int argc, char **argv) {
   pid_t parent = getppid();
 
   board_power_on(&options);
-  line_open(options.port_link);
+  pty_open(options.port_link);
   started_ns = events_mono_ns();
   report_ready(&options);
 
@@ -283,7 +283,7 @@ int main(int argc, char **argv) {
       break; /* the parent died; PR_SET_PDEATHSIG would depend on the thread that started this process */
     }
   }
-  line_unplug();
+  pty_unplug();
   report_statistics("summary");
   events_flush(true);
   return 0;

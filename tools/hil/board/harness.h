@@ -1,7 +1,7 @@
 /* Shared by the two emulated boards, with the functions that each of them must define.
  *
  * board.c (the compiled firmware on simavr) and native_board.c (the firmware's logic compiled for this machine) define
- * the board_* functions; line.c (serial line as a pseudo terminal), sensors.c, events.c and harness.c (main,
+ * the board_* functions; pty.c (serial port as a pseudo terminal), sensors.c, events.c and harness.c (main,
  * commands, pacing) serve both. The commands and events are described at the top of board.c. */
 #ifndef HARNESS_H
 #define HARNESS_H
@@ -49,9 +49,9 @@ bool board_runs_firmware(void);       /* false: in reset, or in the bootloader *
 bool board_hang(bool interrupts_off); /* stops the main loop until the next reset; false: not possible now */
 void board_set_adc(unsigned input, unsigned millivolt);
 
-/* --- the serial line (line.c) ------------------------------------------------------------------------------------ */
+/* --- the serial port (pty.c) ------------------------------------------------------------------------------------- */
 
-struct line_counters {
+struct pty_counters {
   uint64_t rx, tx;                   /* bytes that the board received, sent */
   uint64_t rx_bootloader;            /* written by the host while the board was in reset or in its bootloader */
   uint64_t rx_corrupted, rx_dropped; /* by injected noise */
@@ -61,20 +61,20 @@ struct line_counters {
   uint64_t from_host, to_host; /* taken from and given to the pseudo terminal */
   uint64_t wrong_baud;         /* corrupted: host and board use different rates */
 };
-extern struct line_counters line_counters;
+extern struct pty_counters pty_counters;
 
-void line_open(const char *link);
-void line_unplug(void);
-void line_plug(const char *link);
-const char *line_port(void);
-bool line_is_open(void);                 /* a host has it open */
-void line_poll(void);                    /* once a slice: opened or closed, bytes in */
-void line_flush(ticks_t now);            /* once a slice: bytes out whose stop bit has passed */
-int line_next_byte(uint32_t board_baud); /* the byte that starts to arrive now, or -1; baud 0: the receiver is off */
-ticks_t line_byte_ticks(void);           /* duration of a byte at the host's rate */
-void line_send(ticks_t end, uint8_t byte, uint32_t board_baud);
-bool line_command(const char *verb, double probability);
-void line_flood(ticks_t duration);
+void pty_open(const char *link);
+void pty_unplug(void);
+void pty_plug(const char *link);
+const char *pty_port(void);
+bool pty_is_open(void);                 /* a host has it open */
+void pty_poll(void);                    /* once a slice: opened or closed, bytes in */
+void pty_flush(ticks_t now);            /* once a slice: bytes out whose stop bit has passed */
+int pty_next_byte(uint32_t board_baud); /* the byte that starts to arrive now, or -1; baud 0: the receiver is off */
+ticks_t pty_byte_ticks(void);           /* duration of a byte at the host's rate */
+void pty_send(ticks_t end, uint8_t byte, uint32_t board_baud);
+bool pty_command(const char *verb, double probability);
+void pty_flood(ticks_t duration);
 
 /* --- pressure sensors (sensors.c) -------------------------------------------------------------------------------- */
 

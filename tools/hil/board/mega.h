@@ -27,6 +27,6 @@ void outputs_sample(void); /* reports what has changed */
 void uart_begin(void);
 void uart_after_reset(void);
 void uart_ignore_bytes(void); /* while in reset: what comes meanwhile is lost */
-void uart_start_byte(void);   /* once a slice: the host's next byte begins to arrive, if the line is idle */
+void uart_start_byte(void);   /* once a slice: the host's next byte begins to arrive, if the port is idle */
 
 #endif

@@ -1,6 +1,6 @@
 /* The native board: the firmware's logic (frame.c, output.c, supervisor.c) compiled for this machine.
  *
- * For machines without simavr. Same commands, events, pacing and serial line as board.c, but this file replaces
+ * For machines without simavr. Same commands, events, pacing and serial port as board.c, but this file replaces
  * firmware.ino and the hardware below it: no bootloader, no timer registers (duties are those of the logic), no AVR
  * compiler, no timing of the CPU. It tests the protocol, the states and the safety timers only. */
 #include "harness.h"
@@ -61,7 +61,7 @@ static void loop(void) {
       break;
     }
     tx_free = (tx_free > now ? tx_free : now) + byte_ticks;
-    line_send(tx_free, (uint8_t)byte, BAUD);
+    pty_send(tx_free, (uint8_t)byte, BAUD);
   }
   if (checks == CHECK_UPDATE) {
     watchdog_fed = now;
@@ -70,8 +70,8 @@ static void loop(void) {
 
 void board_run(ticks_t until) {
   while (now < until) {
-    if (rx_now < 0 && (rx_now = line_next_byte(BAUD)) >= 0) {
-      rx_end = now + line_byte_ticks();
+    if (rx_now < 0 && (rx_now = pty_next_byte(BAUD)) >= 0) {
+      rx_end = now + pty_byte_ticks();
     }
     ticks_t watchdog = watchdog_fed + WATCHDOG_TICKS, next = until;
     if (rx_now >= 0 && rx_end < next) {

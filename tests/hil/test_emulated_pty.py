@@ -1,4 +1,4 @@
-"""The serial line of the emulated board: opening, bootloader, DTR, rates, noise, the cable."""
+"""The serial port of the emulated board: opening, bootloader, DTR, rates, noise, the cable."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_host_that_talks_at_once_stays_in_the_bootloader() -> None:
     assert board.summary["rx_bootloader"] == 7 * len(encode(HelloReq(PROTOCOL_HASH)))
 
 
-def test_every_open_resets_and_is_told_apart(board_name: str) -> None:
+def test_every_open_resets_and_has_its_own_boot_id(board_name: str) -> None:
     with EmulatedBoard(board_name) as board:
         ids = []
         for _ in range(2):

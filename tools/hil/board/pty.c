@@ -1,4 +1,4 @@
-/* The serial line of the emulated board: a pseudo terminal, DTR, baud rates, and noise.
+/* The serial port of the emulated board: a pseudo terminal, DTR, baud rates, and noise.
  *
  * simavr's own uart_pty is not used: it dies after a flood and hides that the host closed the port. Here the slave side
  * stays closed, so POLLHUP on the master means "the host has closed the port", and its clearing means "opened", which
@@ -23,7 +23,7 @@
 #define TX_ROOM 4096
 #define BAUD_TOLERANCE 0.04
 
-struct line_counters line_counters;
+struct pty_counters pty_counters;
 
 static int master = -1;
 static char slave_name[64], link_name[4096];
@@ -54,12 +54,12 @@ static void make_link(const char *link) {
   }
 }
 
-void line_open(const char *link) {
+void pty_open(const char *link) {
   master = posix_openpt(O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
   if (master < 0 || grantpt(master) != 0 || unlockpt(master) != 0 || ptsname_r(master, slave_name, sizeof slave_name)) {
     events_fail(EXIT_INTERNAL, "cannot make a pseudo terminal: %s", strerror(errno));
   }
-  /* Opened once: it makes the line raw before the first host comes, and POLLHUP is only reported after a close. */
+  /* Opened once: this sets raw mode before the first host comes, and POLLHUP is only reported after a close. */
   int slave = open(slave_name, O_RDWR | O_NOCTTY | O_CLOEXEC);
   struct termios2 raw;
   if (slave < 0 || ioctl(slave, TCGETS2, &raw) != 0) {
@@ -75,7 +75,7 @@ void line_open(const char *link) {
   make_link(link);
 }
 
-void line_unplug(void) {
+void pty_unplug(void) {
   if (master < 0) {
     return;
   }
@@ -89,18 +89,18 @@ void line_unplug(void) {
   host_open = false;
 }
 
-void line_plug(const char *link) {
+void pty_plug(const char *link) {
   if (master >= 0) {
     return;
   }
   char previous[sizeof link_name];
   memcpy(previous, link_name, sizeof previous);
-  line_open(*link ? link : previous);
+  pty_open(*link ? link : previous);
 }
 
-const char *line_port(void) { return slave_name; }
+const char *pty_port(void) { return slave_name; }
 
-bool line_is_open(void) { return host_open; }
+bool pty_is_open(void) { return host_open; }
 
 /* Reads the host's termios at the master. Rate 0 is how a host drops DTR with termios alone. */
 static void poll_baud(void) {
@@ -124,7 +124,7 @@ static void poll_baud(void) {
   }
 }
 
-void line_poll(void) {
+void pty_poll(void) {
   if (master < 0) {
     return;
   }
@@ -148,9 +148,9 @@ void line_poll(void) {
     if (got <= 0) {
       break;
     }
-    line_counters.from_host += (uint64_t)got;
+    pty_counters.from_host += (uint64_t)got;
     if (!board_runs_firmware()) {
-      line_counters.rx_bootloader += (uint64_t)got;
+      pty_counters.rx_bootloader += (uint64_t)got;
     }
     for (ssize_t i = 0; i < got; i++) {
       rx[(rx_first + rx_count++) % RX_ROOM] = bytes[i];
@@ -162,7 +162,7 @@ void line_poll(void) {
   }
 }
 
-ticks_t line_byte_ticks(void) { return (ticks_t)TICKS_PER_SECOND * BITS_PER_BYTE / host_baud; }
+ticks_t pty_byte_ticks(void) { return (ticks_t)TICKS_PER_SECOND * BITS_PER_BYTE / host_baud; }
 
 static bool rates_differ(uint32_t board_baud) {
   double difference = (double)host_baud - board_baud;
@@ -173,11 +173,11 @@ static bool rates_differ(uint32_t board_baud) {
     events_emit("wrong-baud", "\"host\":%u,\"board\":%u", host_baud, board_baud);
   }
   wrong_baud_reported = true;
-  line_counters.wrong_baud++;
+  pty_counters.wrong_baud++;
   return true;
 }
 
-int line_next_byte(uint32_t board_baud) {
+int pty_next_byte(uint32_t board_baud) {
   uint8_t byte;
   if (board_now() < flood_until || chance(insert_rx)) {
     byte = harness_random();
@@ -189,39 +189,39 @@ int line_next_byte(uint32_t board_baud) {
       byte = rx[rx_first];
       rx_first = (rx_first + 1) % RX_ROOM;
       rx_count--;
-    } while (chance(drop_rx) && ++line_counters.rx_dropped);
+    } while (chance(drop_rx) && ++pty_counters.rx_dropped);
     if (chance(corrupt_rx)) {
       byte ^= 1u << (harness_random() % 8);
-      line_counters.rx_corrupted++;
+      pty_counters.rx_corrupted++;
     }
     if (rates_differ(board_baud)) {
       byte = harness_random();
     }
   }
-  line_counters.rx++;
+  pty_counters.rx++;
   return byte;
 }
 
-void line_flood(ticks_t duration) { flood_until = board_now() + duration; }
+void pty_flood(ticks_t duration) { flood_until = board_now() + duration; }
 
-void line_send(ticks_t end, uint8_t byte, uint32_t board_baud) {
-  line_counters.tx++;
+void pty_send(ticks_t end, uint8_t byte, uint32_t board_baud) {
+  pty_counters.tx++;
   if (!host_open) {
     return;
   }
   if (chance(drop_tx)) {
-    line_counters.tx_dropped++;
+    pty_counters.tx_dropped++;
     return;
   }
   if (chance(corrupt_tx)) {
     byte ^= 1u << (harness_random() % 8);
-    line_counters.tx_corrupted++;
+    pty_counters.tx_corrupted++;
   }
   if (rates_differ(board_baud)) {
     byte = harness_random();
   }
   if (tx_count == TX_ROOM) {
-    line_counters.tx_unread++;
+    pty_counters.tx_unread++;
     return;
   }
   size_t last = (tx_first + tx_count++) % TX_ROOM;
@@ -229,7 +229,7 @@ void line_send(ticks_t end, uint8_t byte, uint32_t board_baud) {
   tx[last].byte = byte;
 }
 
-void line_flush(ticks_t now) {
+void pty_flush(ticks_t now) {
   uint8_t bytes[TX_ROOM];
   size_t count = 0;
   while (tx_count && tx[tx_first].end <= now) {
@@ -241,11 +241,11 @@ void line_flush(ticks_t now) {
     return;
   }
   ssize_t written = write(master, bytes, count);
-  line_counters.to_host += written > 0 ? (size_t)written : 0;
-  line_counters.tx_unread += count - (written > 0 ? (size_t)written : 0);
+  pty_counters.to_host += written > 0 ? (size_t)written : 0;
+  pty_counters.tx_unread += count - (written > 0 ? (size_t)written : 0);
 }
 
-bool line_command(const char *verb, double probability) {
+bool pty_command(const char *verb, double probability) {
   struct {
     const char *verb;
     double *value;
