@@ -1,9 +1,9 @@
 """The fast plant against PyElastica, against the recorded runs, and against itself in other places of a batch."""
 
-import importlib.util
 import json
 from pathlib import Path
 
+import benchmarks
 import numpy as np
 import pytest
 
@@ -16,7 +16,6 @@ from modsoft.training.simulation.rollout import rollout
 
 pytestmark = pytest.mark.instructions
 
-BENCHMARK = Path(__file__).parents[2] / "tools" / "bench" / "simulation.py"
 REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
 ACTIONS = {"cable": 2, "pneumatic": 1}
 
@@ -306,29 +305,29 @@ def test_opposite_cables_share_an_actuator_and_chambers_do_not(kind):
 
 @needs_kernel
 def test_the_benchmark_measures_prints_and_draws(tmp_path):
-    spec = importlib.util.spec_from_file_location("simulation_benchmark", BENCHMARK)
-    benchmark = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(benchmark)
+    benchmark = benchmarks.load("simulation")
     result = benchmark.measured(["pneumatic"], [2], [1, 8], rounds=1)
     assert [row["robots"] for row in result["rows"]] == [1, 8]
     assert all(row["fleet_us"] > 0 and 0 < row["share_of_peak"] < 1 for row in result["rows"])
     assert all(row["ratio"] == row["elastica_us"] / row["fleet_us"] for row in result["rows"])
-    assert result["variant"] == fleet_kernel.variants()[-1]
+    assert result["about"]["variant"] == fleet_kernel.variants()[-1]
     assert result["two_threads"]["ratio_to_peak"] > 0
-    assert benchmark.table(result).count("| pneumatic | 2 | 8 |") == 1
+    assert benchmark.section(result).count("| pneumatic | 2 | 8 |") == 1
     page = tmp_path / "page.md"
-    page.write_text(f"before\n{benchmark.BEGIN}\nold\n{benchmark.END}\nafter\n", encoding="utf-8")
-    benchmark.write_report(result, page)
+    begin, end = benchmark.report.BEGIN, benchmark.report.END
+    page.write_text(f"before\n{begin}\nold\n{end}\nafter\n", encoding="utf-8")
+    benchmark.write_page(result, benchmark.report.Page(page))
     text = page.read_text(encoding="utf-8")
     assert text.startswith("before\n")
     assert text.endswith("\nafter\n")
     assert "old" not in text
-    assert benchmark.table(result) in text
-    assert json.loads((tmp_path / "page" / f"{result['variant']}.json").read_text())["rows"] == result["rows"]
-    assert (tmp_path / "page" / f"{result['variant']}.png").read_bytes().startswith(b"\x89PNG")
-    page.write_text("no marks\n", encoding="utf-8")
+    assert benchmark.section(result) in text
+    file = tmp_path / "page" / result["about"]["variant"]
+    assert json.loads(file.with_suffix(".json").read_text())["rows"] == result["rows"]
+    assert file.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    page.write_text("no markers\n", encoding="utf-8")
     with pytest.raises(UsageError, match="expected one line"):
-        benchmark.write_report(result, page)
+        benchmark.report.Page(page)
 
 
 @pytest.mark.parametrize("count", [1, 20])

@@ -1,11 +1,10 @@
 """The simulated robots behind collection: they agree, and a killed collection of the real robot goes on."""
 
-import importlib.util
 import subprocess
 import sys
 import time
-from pathlib import Path
 
+import benchmarks
 import numpy as np
 import pytest
 
@@ -186,13 +185,10 @@ def test_what_is_missing_or_wrong_is_told(tmp_path, arguments, message):
 
 @needs_fleet
 def test_the_benchmark_of_collection_measures_and_prints():
-    path = Path(__file__).parents[2] / "tools" / "bench" / "collect.py"
-    spec = importlib.util.spec_from_file_location("collect_benchmark", path)
-    benchmark = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(benchmark)
+    benchmark = benchmarks.load("collect")
     result = benchmark.measured([("pneumatic-2", 1200)], [1, 2])
     one, two = result["rows"]
     assert (one["jobs"], two["jobs"], one["over_one"]) == (1, 2, 1.0)
     assert two["over_one"] == one["seconds"] / two["seconds"]
     assert 20 < one["peak_mib"] < 1000
-    assert benchmark.table(result).count("| pneumatic-2 | 1200 |") == 2
+    assert benchmark.section(result).count("| pneumatic-2 | 1200 |") == 2

@@ -1,14 +1,11 @@
-"""How fast modsoft-collect makes data: samples a second by the number of processes, and how much memory it takes.
+"""Speed of modsoft-collect: samples a second by the number of processes, and its memory.
 
-`python tools/bench/collect.py`. Every figure is of the whole command, start and joining of the file included, by the
-wall clock: nothing else should run. The memory is the largest that one of its processes took.
+`python tools/bench/collect.py`. Every figure is of the whole command, its start and the joining of the file included,
+by the wall clock, so no other process should run. The memory is the largest of one of its processes.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import platform
 import subprocess
 import sys
 import tempfile
@@ -17,13 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import click
+import report
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.entry_point import entry
+from modsoft.study.cells import table
 from modsoft.training.data.backends import cores
 from modsoft.training.simulation import simulators
 
-# Runs the command line that follows and tells the largest memory (KiB) of itself and its processes.
+# Runs the command line that follows and prints the largest memory (KiB) of itself and its processes.
 MEASURED = """
 import resource, sys
 from modsoft.training.collect_cli import cli
@@ -36,10 +35,10 @@ def collected(robot: str, samples: int, jobs: int) -> dict[str, Any]:
     """Figures of one collection."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "d.h5"
-        asked = ["--robot", robot, "--samples", str(samples), "--jobs", str(jobs), "--out", str(out)]
+        arguments = ["--robot", robot, "--samples", str(samples), "--jobs", str(jobs), "--out", str(out)]
         start_s = time.perf_counter()
-        found = subprocess.run(
-            [sys.executable, "-P", "-c", MEASURED, *asked],
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", MEASURED, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             check=True,
@@ -52,45 +51,40 @@ def collected(robot: str, samples: int, jobs: int) -> dict[str, Any]:
         "jobs": jobs,
         "seconds": seconds,
         "samples_per_s": samples / seconds,
-        "peak_mib": int(found.stdout.split()[-1]) / 1024,
+        "peak_mib": int(done.stdout.split()[-1]) / 1024,
         "file_mib": size / 2**20,
     }
 
 
-def table(result: dict[str, Any]) -> str:
-    lines = [f"{result['processor']}, {result['cores']} cores, {result['plant']}", ""]
-    lines += ["| robot | samples | processes | s | samples/s | over one process | peak MiB | file MiB |"]
-    lines += ["| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"]
+def section(result: report.Result) -> str:
+    """One result in Markdown."""
+    about, rows = result["about"], []
     for row in result["rows"]:
-        lines.append(
-            f"| {row['robot']} | {row['samples']} | {row['jobs']} | {row['seconds']:.1f} | {row['samples_per_s']:.0f} "
-            f"| {row['over_one']:.2f} | {row['peak_mib']:.0f} | {row['file_mib']:.1f} |"
-        )
-    return "\n".join(lines)
+        speeds = [f"{row['seconds']:.1f}", f"{row['samples_per_s']:.0f}", f"{row['over_one']:.2f}"]
+        sizes = [f"{row['peak_mib']:.0f}", f"{row['file_mib']:.1f}"]
+        rows.append([row["robot"], row["samples"], row["jobs"], *speeds, *sizes])
+    heads = ["robot", "samples", "processes", "s", "samples/s", "over one process", "peak MiB", "file MiB"]
+    return "\n".join([f"{about['processor']}, {about['cores']} cores, {about['backend']}", "", *table(heads, rows)])
 
 
-def measured(sizes: list[tuple[str, int]], jobs: list[int]) -> dict[str, Any]:
-    """Every robot and number of samples, with each number of processes."""
+def measured(sizes: list[tuple[str, int]], jobs: list[int]) -> report.Result:
+    """Figures of every robot and number of samples, with each number of processes."""
     rows = []
     for robot, samples in sizes:
         each = [collected(robot, samples, number) for number in jobs]
         rows += [{**row, "over_one": each[0]["seconds"] / row["seconds"]} for row in each]
-    plant = simulators.fastest(robots.load("cable-4")).name
-    about = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count(), "plant": plant}
-    return {**about, "rows": rows}
+    return {"about": report.about(backend=simulators.fastest(robots.load("cable-4")).name), "rows": rows}
 
 
 @click.command(help=__doc__)
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all figures here, one JSON object.")
-@click.option("--quick", is_flag=True, help="Fewer samples: less than a minute.")
+@report.options("Fewer samples: less than a minute.")
 def main(json_file: Path | None, quick: bool) -> None:
     sizes = [("cable-4", 4800), ("pneumatic-3", 15000)]
     if not quick:
         sizes = [("cable-4", 16000), ("cable-6", 16000), ("pneumatic-3", 15000), ("pneumatic-3", 150000)]
     result = measured(sizes, sorted({1, cores()}))
-    click.echo(table(result))
-    if json_file:
-        json_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    click.echo(section(result))
+    report.write_json(result, json_file)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,14 @@
-"""How late a control tick begins: our ticker, time.sleep and asyncio, at 2.5, 25 and 100 Hz, on a free and a busy core.
+"""Lateness of control ticks: our ticker, time.sleep and asyncio, at 2.5, 25 and 100 Hz, on a free and a busy core.
 
-`python tools/bench/loop.py`. All nine loops run at the same time, each a process of its own on one core, their ticks
-spread over 10 ms so that none meets another: whatever disturbs one disturbs all. Busy: four processes that never rest
-share that core with them. All three wait for absolute deadlines; the other two make up for a late tick at once, ours
-skips it where it is more than half a period late. Lateness is that of the ticks that ran.
+`python tools/bench/loop.py`. All nine loops run at the same time, each as a process on the same core, with their ticks
+spread over 10 ms so that none meets another; a disturbance affects all alike. Busy: four processes that never sleep
+share the core with them. All three wait for absolute deadlines. The other two run a late tick at once; ours skips it if
+it is more than half a period late. Lateness is that of the ticks that ran.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import multiprocessing as mp
 import os
@@ -21,22 +20,23 @@ from typing import Any
 
 import click
 import numpy as np
+import report
 
 from modsoft.runtime.clock import Ticker
 from modsoft.runtime.entry_point import entry
-from modsoft.runtime.log import host
 from modsoft.runtime.stop import Stop
+from modsoft.study.cells import table
 
 RATES_HZ = (2.5, 25.0, 100.0)
 BUSY = 4
-START_S = 0.5  # from when all loops are there
+START_S = 0.5  # after all processes have started
 SPREAD_S = 0.01
 
 Ticks = list[tuple[float, float]]  # (due, begun), seconds of the monotonic clock
 
 
 def our_ticker(period_s: float, start_s: float, end_s: float) -> Ticks:
-    """As in a run: the ticker waits with what a request to stop would wake."""
+    """The ticker of a run, which a request to stop interrupts."""
     ticker = Ticker(period_s, time.monotonic, Stop().wait)
     ticker.start(start_s - time.monotonic())
     ticks = []
@@ -71,22 +71,22 @@ PACES: dict[str, Callable[[float, float, float], Ticks]] = {
 }
 
 
-def paced(pace: str, period_s: float, core: int, told: Connection) -> None:
-    """A process with one loop: says that it is there, is told from when until when, gives its ticks."""
+def paced(pace: str, period_s: float, core: int, connection: Connection) -> None:
+    """A process with one loop: reports that it has started, receives the start and end time, sends its ticks."""
     os.sched_setaffinity(0, {core})
-    told.send("here")
-    told.send(PACES[pace](period_s, *told.recv()))
+    connection.send("started")
+    connection.send(PACES[pace](period_s, *connection.recv()))
 
 
 def busy(core: int) -> None:
-    """A process that never rests."""
+    """A process that never sleeps."""
     os.sched_setaffinity(0, {core})
     while True:
         pass
 
 
 def figures(ticks: Ticks, period_s: float, planned: int) -> dict[str, float | int]:
-    """Of one loop: lateness, ms; slots that it skipped; gaps of less than half a period between two ticks."""
+    """Figures of one loop: lateness, ms; skipped ticks; bursts, gaps of less than half a period between two ticks."""
     due_s, begun_s = np.array(ticks).T
     late_ms = 1e3 * (begun_s - due_s)
     p50, p99, p999 = np.percentile(late_ms, [50, 99, 99.9], method="higher")
@@ -104,7 +104,7 @@ def figures(ticks: Ticks, period_s: float, planned: int) -> dict[str, float | in
 
 
 def measured(seconds: float, busy_processes: int, core: int) -> list[dict[str, Any]]:
-    """All nine loops at once, for so long."""
+    """All nine loops at once, for so many seconds."""
     spawn = mp.get_context("spawn")
     loops = [(pace, hz, *spawn.Pipe()) for hz in RATES_HZ for pace in PACES]
     processes = [spawn.Process(target=paced, args=(pace, 1 / hz, core, theirs)) for pace, hz, _, theirs in loops]
@@ -131,7 +131,7 @@ def measured(seconds: float, busy_processes: int, core: int) -> list[dict[str, A
 
 
 def ratios(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Lateness of the others over ours, at the same rate and load."""
+    """Lateness of the others divided by ours, at the same rate and load."""
     ours = {(row["busy"], row["hz"]): row for row in rows if row["pace"] == "our ticker"}
     return [
         {
@@ -143,40 +143,33 @@ def ratios(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def table(result: dict[str, Any]) -> str:
-    lines = [
-        f"{result['system']}, {result['cores']} cores, load average {result['load_average']:.1f} before; "
-        f"{result['seconds']:g} s each, all at once on core {result['core']}",
-        "",
-    ]
-    lines += [
-        "| busy beside | Hz | pace | ticks | p50 ms | p99 ms | p99.9 ms | max ms | skipped | shortest gap "
-        "/ period | gaps below half |"
-    ]
-    lines += ["| ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"]
+def section(result: report.Result) -> str:
+    """One result in Markdown."""
+    about, rows = result["about"], []
     for row in result["rows"]:
-        lines.append(
-            f"| {row['busy']} | {row['hz']:g} | {row['pace']} | {row['ticks']} | {row['p50_ms']:.3f} "
-            f"| {row['p99_ms']:.3f} | {row['p99_9_ms']:.3f} | {row['max_ms']:.3f} | {row['skipped']} "
-            f"| {row['shortest_gap']:.2f} | {row['bursts']} |"
-        )
-    return "\n".join(lines)
+        lateness = [f"{row[name]:.3f}" for name in ("p50_ms", "p99_ms", "p99_9_ms", "max_ms")]
+        gaps = [row["skipped"], f"{row['shortest_gap']:.2f}", row["bursts"]]
+        rows.append([row["pace"], row["busy"], f"{row['hz']:g}", row["ticks"], *lateness, *gaps])
+    heads = ["pace", "busy processes", "Hz", "ticks", "p50 ms", "p99 ms", "p99.9 ms", "max ms"]
+    heads += ["skipped", "shortest gap / period", "gaps below half"]
+    machine = f"{about['system']}, {about['cores']} cores, load average {about['load_average']:.1f} before"
+    duration = f"{about['seconds']:g} s each, all at once on core {about['core']}"
+    return "\n".join([f"{machine}; {duration}", "", *table(heads, rows)])
 
 
 @click.command(help=__doc__)
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all figures here, one JSON object.")
-@click.option("--seconds", default=420.0, show_default=True, help="Of the free and of the busy core each.")
-@click.option("--quick", is_flag=True, help="10 seconds each: less than a minute.")
+@report.options("10 seconds each: less than a minute.")
+@click.option(
+    "--seconds", default=420.0, show_default=True, help="Duration with the free and with the busy core, each."
+)
 def main(json_file: Path | None, seconds: float, quick: bool) -> None:
     seconds = 10.0 if quick else seconds
     core = max(os.sched_getaffinity(0))
-    about = {**host(), "load_average": os.getloadavg()[0], "seconds": seconds, "core": core}
-    about.pop("name")
+    about = report.about(seconds=seconds, core=core)
     rows = [row for others in (0, BUSY) for row in measured(seconds, others, core)]
-    result = {**about, "rows": rows, "ratios": ratios(rows)}
-    click.echo(table(result))
-    if json_file:
-        json_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    result = {"about": about, "rows": rows, "ratios": ratios(rows)}
+    click.echo(section(result))
+    report.write_json(result, json_file)
 
 
 if __name__ == "__main__":

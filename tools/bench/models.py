@@ -1,75 +1,77 @@
-"""How well the models of tools/models drive the simulated robots that they are for, in closed loop.
+"""Closed-loop errors of the models of tools/models on the simulated robots that they control.
 
-The mean error of each module, base first: of the bending angle in degrees for pneumatic robots, of the unit vector in
-percent for cable robots, with the network alone and with the correction. Nothing here is timed.
+`python tools/bench/models.py`. The mean error of each module, base first: of the bending angle in degrees for pneumatic
+robots, of the unit vector in percent for cable robots, with the network alone and with the correction.
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import click
+import report
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.choices import CORRECTIONS
 from modsoft.runtime.control import correction, tasks
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.entry_point import entry
+from modsoft.study.cells import table
 from modsoft.training.simulation.fleet import simulated
 from modsoft.training.simulation.rollout import ControllerSetup, angle_errors_deg, configuration_errors_percent, rollout
 
-MODELS = Path(__file__).resolve().parents[1] / "models"
-FLOWN = [("pneumatic-3", "pneumatic-3"), ("pneumatic-3", "pneumatic-2"), ("cable-4", "cable-4"), ("cable-4", "cable-6")]
+MODELS = report.ROOT / "tools" / "models"
+# Model and robot.
+PAIRS = [("pneumatic-3", "pneumatic-3"), ("pneumatic-3", "pneumatic-2"), ("cable-4", "cable-4"), ("cable-4", "cable-6")]
 QUICK_STEPS = 20
 
 
-def measure(model: str, name: str, steps: int | None) -> list[dict[str, object]]:
-    """A row for each task and correction."""
-    robot, controller = robots.load(name), Model.load(MODELS / f"{model}.onnx")
-    kind = robot.kind
-    flown = [(task, each) for task in tasks.available(kind, robot.modules) for each in CORRECTIONS]
-    pilots = []
-    for task, each in flown:
-        desired = tasks.task(task, kind, robot.modules)[:steps]
-        pilots.append(
-            ControllerSetup(
-                robot, controller.actuate, controller.history, desired, correction.by_name(each, robot.modules)
-            )
+def measured(name: str, robot_name: str, steps: int | None) -> list[dict[str, Any]]:
+    """A row for each task and correction. steps: of each task; None for all."""
+    robot, model = robots.load(robot_name), Model.load(MODELS / f"{name}.onnx")
+    cases = [(task, each) for task in tasks.available(robot.kind, robot.modules) for each in CORRECTIONS]
+    setups = [
+        ControllerSetup(
+            robot,
+            model.actuate,
+            model.history,
+            tasks.task(task, robot.kind, robot.modules)[:steps],
+            correction.by_name(each, robot.modules),
         )
-    errors = angle_errors_deg if kind == "pneumatic" else configuration_errors_percent
-    rows: list[dict[str, object]] = []
-    rollouts = rollout(simulated(kind, robot.modules, len(pilots)), pilots).robots()
-    for (task, each), pilot, flight in zip(flown, pilots, rollouts, strict=True):
-        mean = errors(flight.configuration, pilot.desired).mean(axis=0)
-        unit = "degrees" if kind == "pneumatic" else "percent"
-        rows.append(
-            {
-                "model": model,
-                "robot": name,
-                "task": task,
-                "correction": each,
-                "unit": unit,
-                "error": [round(float(value), 3) for value in mean],
-            }
-        )
+        for task, each in cases
+    ]
+    errors_of, unit = {
+        "pneumatic": (angle_errors_deg, "degrees"),
+        "cable": (configuration_errors_percent, "percent"),
+    }[robot.kind]
+    rows = []
+    rollouts = rollout(simulated(robot.kind, robot.modules, len(setups)), setups).robots()
+    for (task, each), setup, motion in zip(cases, setups, rollouts, strict=True):
+        mean = errors_of(motion.configuration, setup.desired).mean(axis=0)
+        row = {"model": name, "robot": robot_name, "task": task, "correction": each, "unit": unit}
+        rows.append({**row, "error": [round(float(value), 3) for value in mean]})
     return rows
 
 
-@click.command()
-@click.option("--json", "out", type=click.Path(path_type=Path, dir_okay=False), help="All figures as one object.")
-@click.option("--quick", is_flag=True, help=f"The first {QUICK_STEPS} steps of each task.")
-def main(out: Path | None, quick: bool) -> None:
-    """Fly the models that ship on the robots that they are for."""
+def section(result: report.Result) -> str:
+    """One result in Markdown."""
     rows = []
-    click.echo("| model | robot | task | correction | mean error of each module, base first |\n" + "| --- " * 5 + "|")
-    for model, name in FLOWN:
-        for row in measure(model, name, QUICK_STEPS if quick else None):
-            rows.append(row)
-            told = ", ".join(f"{value:.2f}" for value in row["error"])
-            click.echo(f"| {model} | {name} | {row['task']} | {row['correction']} | {told} {row['unit']} |")
-    if out is not None:
-        out.write_text(json.dumps({"quick": quick, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+    for row in result["rows"]:
+        errors = ", ".join(f"{value:.2f}" for value in row["error"])
+        rows.append([row["model"], row["robot"], row["task"], row["correction"], f"{errors} {row['unit']}"])
+    heads = ["model", "robot", "task", "correction", "mean error of each module, base first"]
+    return "\n".join(table(heads, rows)).rstrip()
+
+
+@click.command(help=__doc__)
+@report.options(f"The first {QUICK_STEPS} steps of each task.")
+def main(json_file: Path | None, quick: bool) -> None:
+    steps = QUICK_STEPS if quick else None
+    rows = [row for name, robot_name in PAIRS for row in measured(name, robot_name, steps)]
+    result = {"about": report.about(quick=quick), "rows": rows}
+    click.echo(section(result))
+    report.write_json(result, json_file)
 
 
 if __name__ == "__main__":
