@@ -64,7 +64,8 @@ def section(result: report.Result) -> str:
         sizes = [f"{row['peak_mib']:.0f}", f"{row['file_mib']:.1f}"]
         rows.append([row["robot"], row["samples"], row["jobs"], *speeds, *sizes])
     heads = ["robot", "samples", "processes", "s", "samples/s", "over one process", "peak MiB", "file MiB"]
-    return "\n".join([f"{about['processor']}, {about['cores']} cores, {about['backend']}", "", *table(heads, rows)])
+    lines = [f"{about['processor']}, {about['cores']} cores, {about['backend']}", "", *table(heads, rows)]
+    return "\n".join(lines).rstrip()
 
 
 def measured(sizes: list[tuple[str, int]], jobs: list[int]) -> report.Result:
@@ -83,8 +84,7 @@ def main(json_file: Path | None, quick: bool) -> None:
     if not quick:
         sizes = [("cable-4", 16000), ("cable-6", 16000), ("pneumatic-3", 15000), ("pneumatic-3", 150000)]
     result = measured(sizes, sorted({1, cores()}))
-    click.echo(section(result))
-    report.write_json(result, json_file)
+    report.publish(result, section, json_file)
 
 
 if __name__ == "__main__":

@@ -99,10 +99,7 @@ def main(isa: str, json_file: Path | None, page: report.Page | None, quick: bool
         for warm in (True,) if quick else (True, False):
             rows.append({**figures(modules, count, ticks(modules, count, model, warm)), "warm": warm})
     result = {"about": about(isa), "rows": rows}
-    click.echo(section(result))
-    report.write_json(result, json_file)
-    if page:
-        page.update(isa, result, section)
+    report.publish(result, section, json_file, page, isa)
 
 
 if __name__ == "__main__":

@@ -154,7 +154,7 @@ def section(result: report.Result) -> str:
     heads += ["skipped", "shortest gap / period", "gaps below half"]
     machine = f"{about['system']}, {about['cores']} cores, load average {about['load_average']:.1f} before"
     duration = f"{about['seconds']:g} s each, all at once on core {about['core']}"
-    return "\n".join([f"{machine}; {duration}", "", *table(heads, rows)])
+    return "\n".join([f"{machine}; {duration}", "", *table(heads, rows)]).rstrip()
 
 
 @click.command(help=__doc__)
@@ -168,8 +168,7 @@ def main(json_file: Path | None, seconds: float, quick: bool) -> None:
     about = report.about(seconds=seconds, core=core)
     rows = [row for others in (0, BUSY) for row in measured(seconds, others, core)]
     result = {"about": about, "rows": rows, "ratios": ratios(rows)}
-    click.echo(section(result))
-    report.write_json(result, json_file)
+    report.publish(result, section, json_file)
 
 
 if __name__ == "__main__":

@@ -70,8 +70,7 @@ def main(json_file: Path | None, quick: bool) -> None:
     steps = QUICK_STEPS if quick else None
     rows = [row for name, robot_name in PAIRS for row in measured(name, robot_name, steps)]
     result = {"about": report.about(quick=quick), "rows": rows}
-    click.echo(section(result))
-    report.write_json(result, json_file)
+    report.publish(result, section, json_file)
 
 
 if __name__ == "__main__":

@@ -80,6 +80,16 @@ def write_json(result: Result, path: Path | None) -> None:
             temporary.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
+def publish(
+    result: Result, section: Callable[[Result], str], json_file: Path | None, page: Page | None = None, name: str = ""
+) -> None:
+    """Prints the section of a result, and writes its JSON file and its page, where it is stored as `name`."""
+    click.echo(section(result))
+    write_json(result, json_file)
+    if page:
+        page.update(name, result, section)
+
+
 def about(**more: Any) -> dict[str, Any]:
     """The machine and the commit of a measurement."""
     return {

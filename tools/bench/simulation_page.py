@@ -38,7 +38,7 @@ def section(result: report.Result) -> str:
 
 
 def _two_threads(threads: dict[str, float]) -> str:
-    """The gain of a second thread in words."""
+    """The gain of a second thread, as a sentence."""
     multiply_adds = f"Multiply-adds alone gain {threads['peak_ratio']:.2f} times from a second thread"
     if threads["peak_ratio"] < FREE_CORE_GAIN:
         return f"{multiply_adds}: other load occupied the second core, so the kernel's gain was not measured."

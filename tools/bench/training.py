@@ -242,10 +242,7 @@ def main(
             minutes = min(minutes, 0.7)
         steps = step_times_at(isa, 3 if quick else 30)
         result = {"about": about, **raced(race, minutes, turn_s, isa), "steps": steps}
-    click.echo(section(result))
-    report.write_json(result, json_file)
-    if page:
-        page.update(isa, result, section)
+    report.publish(result, section, json_file, page, isa)
 
 
 if __name__ == "__main__":

@@ -73,7 +73,7 @@ def study(out: Path, jobs: int | None, quick: bool, only: str | None) -> None:
             click.echo(f"{out}: about {total} with {processes} processes on as many free cores ({by_stage})", err=True)
         for name, make in zip(STAGES, makers, strict=False):
             if only in (None, name):
-                make(planned, folder, processes).run(processes)  # made here: its items depend on the stages before
+                make(planned, folder, processes).run(processes)  # its items depend on the stages before
         for name, write in writers.items():
             if only in (None, name):
                 write()

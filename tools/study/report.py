@@ -1,4 +1,4 @@
-"""report.md, made from results.json alone, with the notes that people wrote."""
+"""Writes report.md from results.json alone, and includes the notes that people wrote."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Oracle error: the smallest error that any sequence of actions is known to reach,
 is an upper bound of the optimum. Targets, set for the biLSTM on rich data: half of the paper's error for the network
 alone; with correction a tenth of the paper's error or 1.1 times the oracle error, whichever is larger. Task B begins
 with a jump from rest. The paper leaves the first steps out; here these are the first five, and a second table has all
-steps."""
+steps. All numbers are in `results.json`; `tools/study/results.py` describes its fields."""
 
 END_EFFECTOR = """\
 Task B holds the end of the robot in place while the modules rotate, task C holds its orientation. The table has the
@@ -74,9 +74,9 @@ def _notes(folder: Folder) -> str:
     return read_text(folder.notes).strip() if folder.notes.is_file() else ""
 
 
-def lines(found: Results, notes: str) -> list[str]:
+def lines(stored: Results, notes: str) -> list[str]:
     """The lines of the report."""
-    records, about = found.records, found.about
+    records, about = stored.records, stored.about
     comparisons = {
         "Table 1: actuation estimation": tables.estimation(records),
         "Table 2: four modules": tables.control(records, "2", 4),

@@ -65,7 +65,7 @@ def rollout_s(plan: Plan, batch: Sequence[Run]) -> float:
 
 
 def _by_robot(runs: Sequence[Run]) -> list[list[Run]]:
-    """Runs grouped by their simulated robot, so that each group can share a fleet."""
+    """The runs of each simulated robot, which can run in one fleet."""
 
     def robot_of(run: Run) -> tuple[int, str]:
         return run.modules, repr(perturbations.robot_properties(run.perturbation, run.modules, run.model.seed))

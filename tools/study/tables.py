@@ -1,4 +1,4 @@
-"""The report's tables, each made from the records alone."""
+"""The report's tables, each from the records alone."""
 
 from __future__ import annotations
 
