@@ -61,7 +61,7 @@ def weights_of(content: dict[str, Any], key: str | None, where: Path) -> Weights
 
 def refuse(content: dict[str, Any], where: Path, untold: str) -> NoReturn:
     """`ModelError` with what a checkpoint holds and how to export it; `untold`: what has to be added to the weights."""
-    if "optimiser" in content and "identity" in content:
+    if "identity" in content and {"optimizer", "optimiser"} & content.keys():  # "optimiser": version 0.1.0
         raise ModelError(f"{where}: the state of a training that has not ended; start modsoft-train again to end it")
     weights_of(content, None, where)  # another network is not exported with --meta either
     (key,) = (key for key, _ in state_dicts(content))

@@ -27,7 +27,9 @@ def test_refused_word_is_found(text):
     assert [line for line, _ in words.findings(text, {"colour": "color", "bright red": "red"})] == [1]
 
 
-@pytest.mark.parametrize("text", ["colours", "discoloured", "bright or red", "brightred", ""])
+@pytest.mark.parametrize(
+    "text", ["colours", "discoloured", "bright or red", "brightred", "colour = 1  # words: old names", ""]
+)
 def test_other_words_are_kept(text):
     assert list(words.findings(text, {"colour": "color", "bright red": "red"})) == []
 

@@ -103,7 +103,7 @@ def cli(
     finally:
         if bar is not None:
             bar.close()
-    lost = f"; {made.redrawn} robots went non-finite, were dropped and drawn again" if made.redrawn else ""
+    lost = f"; {made.rejected} episodes diverged and were replaced" if made.rejected else ""
     rounded = f" ({samples} rounded up to whole episodes of {steps})" if made.samples != samples else ""
     click.echo(f"{out}: {made.samples} samples in {made.episodes} episodes{rounded}{lost}")
 

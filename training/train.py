@@ -117,8 +117,8 @@ def _of_code_and_data(data: Sequence[DataSet]) -> dict[str, Any]:
         "code_version": version("modsoft"),
         "torch_version": str(torch.__version__),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "recipes": [{key: value for key, value in each.recipe.items() if key != "robot"} for each in data],
-        "strategy": " + ".join(each.recipe["strategy"] for each in data),
+        "generation": [{key: value for key, value in each.generation.items() if key != "robot"} for each in data],
+        "strategy": " + ".join(each.generation["strategy"] for each in data),
         "samples": sum(each.samples for each in data),
     }
 
@@ -154,9 +154,9 @@ def data_sha256(data: Sequence[DataSet]) -> str:
 
 def _robot(data: Sequence[DataSet]) -> dict[str, Any]:
     """The robot file of all data sets, as plain values; `ModelError` where they differ."""
-    robot = data[0].recipe["robot"]
+    robot = data[0].generation["robot"]
     for each in data[1:]:
-        if each.recipe["robot"] != robot:
+        if each.generation["robot"] != robot:
             raise ModelError(
                 f"data sets of different robots, {data[0].robot.name} and {each.robot.name} (or of one with other "
                 "limits or another rate); a model is trained on data of one robot"

@@ -15,10 +15,10 @@ from modsoft.training.data import dataset
 def data_file(tmp_path):
     """A small data set that is sound so far."""
     robot = robots.load("pneumatic-2")
-    recipe = {"robot": robot.to_dict(), "strategy": "random", "steps": 3}
+    generation = {"robot": robot.to_dict(), "strategy": "random", "steps": 3}
     configuration = np.tile([0.0, 0.0, 1.0], (2, 4, 2, 1))
     path = tmp_path / "data.h5"
-    dataset.write(dataset.DataSet(recipe, configuration, np.zeros((2, 3, 2, 1)), np.array([0, 3]), 0), path)
+    dataset.write(dataset.DataSet(generation, configuration, np.zeros((2, 3, 2, 1)), np.array([0, 3]), 0), path)
     dataset.read(path)
     return path
 
@@ -71,8 +71,8 @@ def a_group(file, folder):
     [
         (linked, "action is a link"),
         (soft_linked, "action is a link"),
-        (stored_elsewhere, "action lies in other files"),
-        (virtual, "action lies in other files"),
+        (stored_elsewhere, "action is stored in other files"),
+        (virtual, "action is stored in other files"),
         (objects, "action is no array of floats"),
         (a_group, "action is no array of floats"),
         (huge, "action claims 32000000000000 bytes, the file holds 0"),
@@ -134,8 +134,8 @@ def test_actions_that_are_a_pickle_end_modsoft_simulate_with_65(tmp_path, mark, 
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("recipe", ["", "[]", "{}", '{"robot": 1}', '{"robot": {}}', "[" * 10**5, "null"])
-def test_a_data_set_that_does_not_say_what_it_is_of(data_file, recipe, refused):
+@pytest.mark.parametrize("generation", ["", "[]", "{}", '{"robot": 1}', '{"robot": {}}', "[" * 10**5, "null"])
+def test_a_data_set_that_does_not_say_what_it_is_of(data_file, generation, refused):
     with h5py.File(data_file, "r+") as file:
-        file.attrs["recipe"] = recipe
+        file.attrs["generation"] = generation
     refused(dataset.read, data_file)

@@ -34,8 +34,8 @@ def parts(tmp_path):
     """The folder as a collection begins it."""
     folder = tmp_path / "d.h5.parts"
     folder.mkdir()
-    recipe = collect.recipe_of(ROBOT, "random", 0, 10, "still")
-    (folder / "recipe.json").write_text(json.dumps(recipe))
+    generation = collect.generation_settings(ROBOT, "random", 0, 10, "still")
+    (folder / "generation.json").write_text(json.dumps(generation))
     return folder
 
 
@@ -51,34 +51,34 @@ def claims_too_much(path):
     header = b"\x93NUMPY\x01\x00" + (118).to_bytes(2, "little")
     header += b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,)}".ljust(117) + b"\n"
     with zipfile.ZipFile(path, "w") as archive:
-        for name in ("configuration", "action", "redrawn"):
+        for name in ("configuration", "action", "rejected"):
             archive.writestr(f"{name}.npy", header)
 
 
 def text(path):
-    np.savez(path, configuration=np.full((11, 2, 3), "x"), action=np.full((10, 2, 1), "x"), redrawn=0)
+    np.savez(path, configuration=np.full((11, 2, 3), "x"), action=np.full((10, 2, 1), "x"), rejected=0)
 
 
 def other_action(path):
-    np.savez(path, configuration=still(ROBOT, np.zeros((1, 10, 2, 1)))[0], action=np.zeros((10, 3, 1)), redrawn=0)
+    np.savez(path, configuration=still(ROBOT, np.zeros((1, 10, 2, 1)))[0], action=np.zeros((10, 3, 1)), rejected=0)
 
 
 @pytest.mark.parametrize("attack", [claims_too_much, text, other_action, Path.touch])
-def test_an_odd_episode_is_made_again(tmp_path, parts, attack):
+def test_invalid_episode_is_replaced(tmp_path, parts, attack):
     attack(parts / "episode-000001.npz")
     assert collected(tmp_path / "d.h5").samples == 20
     assert dataset.read(tmp_path / "d.h5").samples == 20
 
 
 @pytest.mark.parametrize("name", ["episode-000000.npz", ".episode-000000.npz.x.tmp"])
-def test_a_folder_in_the_place_of_a_file_is_told(tmp_path, parts, name):
+def test_folder_in_the_place_of_an_episode_is_refused(tmp_path, parts, name):
     (parts / name).mkdir()
-    with pytest.raises(OutputError, match=f"{name}: no whole episode, and cannot be deleted"):
+    with pytest.raises(OutputError, match=f"{name}: not a complete episode, and cannot be deleted"):
         collected(tmp_path / "d.h5")
 
 
 def test_a_pickle_among_the_episodes_is_not_run(tmp_path, parts, mark, evil):
-    np.savez(parts / "episode-000000.npz", configuration=np.array([evil]), action=np.zeros((10, 2, 1)), redrawn=0)
+    np.savez(parts / "episode-000000.npz", configuration=np.array([evil]), action=np.zeros((10, 2, 1)), rejected=0)
     collected(tmp_path / "d.h5")
     assert not mark.exists()
 
@@ -94,7 +94,7 @@ def test_results_of_jobs_that_were_there_before_are_not_unpickled(tmp_path, part
 
     monkeypatch.setattr(submitit.AutoExecutor, "map_array", caught)
     for _ in range(2):
-        for there in folders:  # what a stranger may know of an earlier run
+        for there in folders:  # an attacker may know the folders of earlier runs
             there.mkdir(exist_ok=True)
             (there / "1_0_result.pkl").write_bytes(pickle.dumps(("success", evil)))
         with pytest.raises(InUse, match="caught"):
@@ -142,10 +142,10 @@ def test_other_names_are_left_alone(tmp_path, parts, name):
     collected(tmp_path / "d.h5")
 
 
-@pytest.mark.parametrize("recipe", ["", "[]", "[" * 10**5, "null", '"x"', "\xff"])
-def test_a_recipe_that_is_none(tmp_path, parts, recipe, refused):
-    (parts / "recipe.json").write_text(recipe, encoding="latin-1")
-    refused(collected, tmp_path / "d.h5", "recipe")
+@pytest.mark.parametrize("generation", ["", "[]", "[" * 10**5, "null", '"x"', "\xff"])
+def test_invalid_generation_settings_are_refused(tmp_path, parts, generation, refused):
+    (parts / "generation.json").write_text(generation, encoding="latin-1")
+    refused(collected, tmp_path / "d.h5", "generation")
 
 
 # ---- Two at a time --------------------------------------------------------------------------------------------------

@@ -174,7 +174,7 @@ def test_missing_results_are_refused_with_the_command_that_makes_them(tmp_path, 
 def test_miniature_and_full_study_are_not_mixed_in_one_folder(study, ended):
     code, _, error = ended("study", "--jobs", "1", "--only", "collect", "--out", study)
     assert code == ModelError.exit_code
-    assert "asked for" in error.splitlines()[-1]
+    assert "expected" in error.splitlines()[-1]
     assert "Traceback" not in error
 
 

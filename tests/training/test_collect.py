@@ -39,19 +39,19 @@ def simulator(function=simulate, batch_size: int = 1) -> Simulator:
     return Simulator("stand-in", function, batch_size)
 
 
-def test_an_episode_depends_on_seed_and_index_alone():
+def test_episode_depends_on_seed_and_index_alone():
     robot = of_modules("pneumatic", 3, 0.4)
-    recipe = c.recipe_of(robot, "staged", 7, 30, "stand-in")
-    (one,) = c.episodes(recipe, robot, [4], simulate)
-    _, again, other = c.episodes(recipe, robot, [9, 4, 5], simulate)
-    (of_other_seed,) = c.episodes({**recipe, "seed": 8}, robot, [4], simulate)
+    generation = c.generation_settings(robot, "staged", 7, 30, "stand-in")
+    (one,) = c.episodes(generation, robot, [4], simulate)
+    _, again, other = c.episodes(generation, robot, [9, 4, 5], simulate)
+    (with_other_seed,) = c.episodes({**generation, "seed": 8}, robot, [4], simulate)
     assert np.array_equal(one[0], again[0])
     assert np.array_equal(one[1], again[1])
     assert not np.array_equal(one[1], other[1])
-    assert not np.array_equal(one[1], of_other_seed[1])
+    assert not np.array_equal(one[1], with_other_seed[1])
 
 
-def test_a_data_set_carries_its_recipe_and_reads_back(tmp_path):
+def test_a_data_set_carries_its_generation_and_reads_back(tmp_path):
     robot = of_modules("pneumatic", 3, 0.4)
     out = tmp_path / "d.h5"
     seen = []
@@ -60,16 +60,16 @@ def test_a_data_set_carries_its_recipe_and_reads_back(tmp_path):
     assert list(tmp_path.iterdir()) == [out]
     data = dataset.read(out)
     assert data.robot == robot
-    assert made == dataset.Header(data.recipe, made.stage_borders, 0, 4)
+    assert made == dataset.Header(data.generation, made.stage_borders, 0, 4)
     assert made.samples == data.samples == 120
     assert data.configuration.shape == (4, 31, 3, 3)
     assert data.action.shape == (4, 30, 3, 1)
     assert list(data.stage_borders) == [0, 10, 20, 30]
-    assert (data.recipe["strategy"], data.recipe["seed"], data.recipe["period_s"]) == ("staged", 3, 0.4)
-    assert len(data.recipe["plant_sha256"]) == 64
+    assert (data.generation["strategy"], data.generation["seed"], data.generation["period_s"]) == ("staged", 3, 0.4)
+    assert len(data.generation["simulator_sha256"]) == 64
     np.testing.assert_array_equal(data.configuration, simulate(robot, data.action))
     with h5py.File(out) as file:
-        assert set(file.attrs) == {"schema", "recipe", "stage_borders", "redrawn"}
+        assert set(file.attrs) == {"schema", "generation", "stage_borders", "rejected"}
 
 
 @pytest.mark.parametrize("together", [1, 3])
@@ -87,7 +87,7 @@ def test_an_episode_that_is_not_finite_is_drawn_again_and_counted(tmp_path, toge
 
     c.collect(robot, tmp_path / "d.h5", 120, "random", 0, 10, simulator=simulator(sometimes_lost, together))
     data = dataset.read(tmp_path / "d.h5")
-    assert data.redrawn == len(lost) > 2
+    assert data.rejected == len(lost) > 2
     assert np.all(data.action[:, 0, 0, 0] <= 0.5)
     np.testing.assert_array_equal(data.configuration, simulate(robot, data.action))
 
@@ -117,9 +117,9 @@ def parts_of_one_episode(tmp_path) -> Path:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": 2}, "seed 1, asked for 2"),
-        ({"strategy": "random"}, "strategy staged, asked for random"),
-        ({"steps": 20}, "steps 30, asked for 20"),
+        ({"seed": 2}, "seed 1, expected 2"),
+        ({"strategy": "random"}, "strategy staged, expected random"),
+        ({"steps": 20}, "steps 30, expected 20"),
         ({"robot": of_modules("pneumatic", 2, 0.4)}, "another robot"),
     ],
 )
@@ -155,7 +155,7 @@ def test_a_damaged_episode_is_made_again(tmp_path, damage):
     robot = of_modules("pneumatic", 3, 0.4)
     c.collect(robot, out, 60, "staged", 1, 30, simulator=simulator())
     data = dataset.read(out)
-    np.testing.assert_array_equal(data.action[0], c.episodes(data.recipe, robot, [0], simulate)[0][1])
+    np.testing.assert_array_equal(data.action[0], c.episodes(data.generation, robot, [0], simulate)[0][1])
 
 
 def test_a_finished_data_set_is_not_made_again(tmp_path):
@@ -168,7 +168,7 @@ def test_a_finished_data_set_is_not_made_again(tmp_path):
 
     assert c.collect(robot, out, 20, "random", 0, 10, simulator=simulator(never)).samples == 20
     assert out.stat().st_mtime_ns == written
-    with pytest.raises(ModelError, match="2 episodes of 10 steps, asked for 3"):
+    with pytest.raises(ModelError, match="2 episodes of 10 steps, expected 3"):
         c.collect(robot, out, 30, "random", 0, 10, simulator=simulator(never))
 
 
@@ -186,7 +186,10 @@ def test_what_a_kill_at_the_very_end_left_is_cleared_away(tmp_path, kept):
 
 def test_an_episode_that_is_not_finite_does_not_pass_the_last_door(tmp_path):
     good = c.episodes(
-        c.recipe_of(of_modules("pneumatic", 2), "random", 0, 10, "p"), of_modules("pneumatic", 2), [0], simulate
+        c.generation_settings(of_modules("pneumatic", 2), "random", 0, 10, "p"),
+        of_modules("pneumatic", 2),
+        [0],
+        simulate,
     )
     bad = good[0]._replace(configuration=np.full_like(good[0].configuration, np.nan))
     with pytest.raises(ModelError, match="episode 1 is not finite"):
@@ -288,7 +291,7 @@ def test_an_error_in_a_worker_ends_the_command_with_its_own_message(tmp_path):
     assert found.returncode != 0
     assert "no simulator" in found.stderr
     assert not (tmp_path / "d.h5").exists()
-    assert json.loads((tmp_path / "d.h5.parts" / "recipe.json").read_text())["seed"] == 5
+    assert json.loads((tmp_path / "d.h5.parts" / "generation.json").read_text())["seed"] == 5
 
 
 MEMORY = """
@@ -321,8 +324,8 @@ def test_memory_does_not_grow_with_the_number_of_samples(tmp_path):
 
 def test_the_robots_of_a_varied_data_set_differ_from_the_drawing_eight_episodes_alike():
     robot = robots.load("cable-4")
-    recipe = c.recipe_of(robot, "varied", 5, 30, "stand-in")
-    found = [c.perturbation_of(recipe, robot, index) for index in range(400)]
+    generation = c.generation_settings(robot, "varied", 5, 30, "stand-in")
+    found = [c.perturbation_of(generation, robot, index) for index in range(400)]
     assert len(set(found)) == 50
     assert all(len(set(found[i : i + 8])) == 1 for i in range(0, 400, 8))
     stiffness = np.array([each.stiffness for each in found])
@@ -333,22 +336,22 @@ def test_the_robots_of_a_varied_data_set_differ_from_the_drawing_eight_episodes_
     module_kg = 1050 * np.pi * 0.01**2 * 0.05
     assert 0.1 < np.mean(payloads == 0.0) < 0.5
     assert 2.5 * module_kg < payloads.max() < 4 * module_kg
-    assert c.perturbation_of(c.recipe_of(robot, "smooth", 5, 30, "stand-in"), robot, 0) == NOMINAL
+    assert c.perturbation_of(c.generation_settings(robot, "smooth", 5, 30, "stand-in"), robot, 0) == NOMINAL
 
 
 def test_an_episode_is_simulated_on_its_own_robot_whatever_is_asked_for_with_it():
     robot = robots.load("cable-4")
-    recipe = c.recipe_of(robot, "varied", 5, 6, "stand-in")
+    generation = c.generation_settings(robot, "varied", 5, 6, "stand-in")
 
     def stiff(robot, actions, *, perturbation):
         angles = np.zeros((len(actions), 7, 4))
         angles[:, 1:] = 10.0 * actions[..., 0] / np.array(perturbation.stiffness)
         return from_angles_deg(angles)
 
-    together = c.episodes(recipe, robot, [3, 9, 4], stiff)
+    together = c.episodes(generation, robot, [3, 9, 4], stiff)
     for index, episode in zip([3, 9, 4], together, strict=True):
-        (alone,) = c.episodes(recipe, robot, [index], stiff)
+        (alone,) = c.episodes(generation, robot, [index], stiff)
         np.testing.assert_array_equal(episode.configuration, alone.configuration)
-        factors = np.array(c.perturbation_of(recipe, robot, index).stiffness)
+        factors = np.array(c.perturbation_of(generation, robot, index).stiffness)
         expected = from_angles_deg(10.0 * episode.action[..., 0] / factors)
         np.testing.assert_allclose(episode.configuration[1:], expected, atol=1e-12)

@@ -63,9 +63,9 @@ def write(path, name: str, strategy: str, episodes: int = 20, steps: int = 150) 
     across = np.zeros((episodes, steps + 1, robot.modules, 2))
     across[:, 1:, :, : robot.action_size] = 0.5 * action
     along = np.sqrt(1 - np.sum(across**2, axis=-1, keepdims=True))
-    recipe = {"robot": robot.to_dict(), "strategy": strategy, "steps": steps}
+    generation = {"robot": robot.to_dict(), "strategy": strategy, "steps": steps}
     borders = actions.stage_borders(strategy, robot.modules, steps)
-    dataset.write(dataset.DataSet(recipe, np.concatenate([across, along], -1), action, borders, 0), path)
+    dataset.write(dataset.DataSet(generation, np.concatenate([across, along], -1), action, borders, 0), path)
 
 
 def test_staged_data_cover_more_of_the_tips_space_than_random(tmp_path):

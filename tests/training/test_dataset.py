@@ -16,11 +16,11 @@ def make(episodes: int, steps: int, kind: str = "pneumatic-3", stages: int = 3, 
     angles = rng.uniform(-90, 90, (episodes, steps + 1, robot.modules))
     angles[:, 0] = 0.0
     return d.DataSet(
-        recipe={"robot": robot.to_dict(), "strategy": "staged", "seed": seed, "steps": steps},
+        generation={"robot": robot.to_dict(), "strategy": "staged", "seed": seed, "steps": steps},
         configuration=from_angles_deg(angles),
         action=rng.uniform(-1, 1, (episodes, steps, robot.modules, robot.action_size)),
         stage_borders=np.round(np.linspace(0, steps, stages + 1)).astype(np.int64),
-        redrawn=0,
+        rejected=0,
     )
 
 
@@ -67,7 +67,7 @@ def test_wrong_shapes_and_values_are_refused(tmp_path):
     with pytest.raises(ModelError, match="configuration holds values that are not finite"):
         d.read(path)
     data = make(2, 30)
-    d.write(d.DataSet(data.recipe, data.configuration[:, :-1], data.action, data.stage_borders, 0), path)
+    d.write(d.DataSet(data.generation, data.configuration[:, :-1], data.action, data.stage_borders, 0), path)
     with pytest.raises(ModelError, match=r"configuration has the shape \(2, 30, 3, 3\), expected \(2, 31, 3, 3\)"):
         d.read(path)
 

@@ -1,4 +1,4 @@
-"""Data sets that a user wrote from the log of a real robot: what fits is trained on, the rest is one line and 65."""
+"""Data sets that a user wrote from the log of a real robot: valid ones are read, others are refused in one line."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ from modsoft.training import collect_cli, train_cli
 from modsoft.training.data import dataset
 
 E, K, N = 2, 12, 3
-RECIPE = {"robot": robots.load("pneumatic-3").to_dict(), "strategy": "real robot"}
+GENERATION = {"robot": robots.load("pneumatic-3").to_dict(), "strategy": "real robot"}
 ANGLES = np.concatenate([np.zeros((E, 1, N)), np.random.default_rng(0).uniform(-0.5, 0.5, (E, K, N))], axis=1)
 ACTION = 2.0 * ANGLES[:, 1:, :, None]
 CONFIGURATION = np.stack([np.sin(ANGLES), 0.0 * ANGLES, np.cos(ANGLES)], axis=-1)
@@ -26,45 +26,45 @@ def put(values, place, value):
     return changed
 
 
-def written(path, configuration=CONFIGURATION, action=ACTION, recipe=RECIPE, **attributes):
-    """The file, by h5py alone; an attribute `...` is left out."""
+def written(path, configuration=CONFIGURATION, action=ACTION, generation=GENERATION, **attributes):
+    """A file written by h5py alone; an attribute `...` is omitted."""
     with h5py.File(path, "w") as file:
         for name, values in (("configuration", configuration), ("action", action)):
             if values is not ...:
                 file[name] = values
-        found = {"schema": 1, "recipe": recipe, "stage_borders": np.array([0, K]), "redrawn": 0} | attributes
-        for name, value in found.items():
+        present = {"schema": 2, "generation": generation, "stage_borders": np.array([0, K]), "rejected": 0} | attributes
+        for name, value in present.items():
             if value is not ...:
                 file.attrs[name] = json.dumps(value) if isinstance(value, dict | list) else value
     return path
 
 
-AS_IT_IS = {
+VALID = {
     "float64": {},
     "float32": {"configuration": CONFIGURATION.astype("f4"), "action": ACTION.astype("f4")},
     "float16": {"configuration": CONFIGURATION.astype("f2"), "action": ACTION.astype("f2")},
     "big-endian": {"configuration": CONFIGURATION.astype(">f8"), "action": ACTION.astype(">f8")},
     "four decimals": {"configuration": CONFIGURATION.round(4)},
-    "recipe as bytes": {"recipe": np.bytes_(json.dumps(RECIPE))},
-    "recipe with a byte order mark": {"recipe": np.bytes_(b"\xef\xbb\xbf" + json.dumps(RECIPE).encode())},
-    "small integers": {"stage_borders": np.array([0, 4, K], "u1"), "schema": np.int8(1), "redrawn": np.array([0])},
+    "generation as bytes": {"generation": np.bytes_(json.dumps(GENERATION))},
+    "generation with a byte order mark": {"generation": np.bytes_(b"\xef\xbb\xbf" + json.dumps(GENERATION).encode())},
+    "small integers": {"stage_borders": np.array([0, 4, K], "u1"), "schema": np.int8(2), "rejected": np.array([0])},
     "an empty stage": {"stage_borders": np.array([0, 0, K])},
-    "period and steps": {"recipe": {**RECIPE, "steps": K, "period_s": 0.4, "seed": None}},
+    "period and steps": {"generation": {**GENERATION, "steps": K, "period_s": 0.4, "seed": None}},
 }
 
 
-@pytest.mark.parametrize("kind", AS_IT_IS)
-def test_what_means_the_same_is_read_as_float64(tmp_path, kind):
-    data = dataset.read(written(tmp_path / "own.h5", **AS_IT_IS[kind]))
+@pytest.mark.parametrize("kind", VALID)
+def test_valid_data_sets_are_read_as_float64(tmp_path, kind):
+    data = dataset.read(written(tmp_path / "own.h5", **VALID[kind]))
     for found, expected in ((data.configuration, CONFIGURATION), (data.action, ACTION)):
         assert found.dtype == np.dtype("=f8")
         np.testing.assert_allclose(found, expected, atol=1e-3)
-    assert data.recipe["strategy"] == "real robot"
+    assert data.generation["strategy"] == "real robot"
     assert sum(map(len, dataset.split(data, 2, "shuffled", 0))) == E * K
 
 
 BORDERS = "expected whole numbers that rise from 0 to 12, the steps of an episode"
-WRONG = {
+INVALID = {
     "degrees": ({"configuration": np.degrees(ANGLES)[..., None] * [1.0, 0, 0]}, "of length 0; expected a unit vector"),
     "not normalised": (
         {"configuration": 1.01 * CONFIGURATION},
@@ -85,7 +85,7 @@ WRONG = {
     "complex": ({"configuration": CONFIGURATION.astype(complex)}, "configuration is no array of floats"),
     "integers": ({"action": np.zeros(ACTION.shape, int)}, "action is no array of floats"),
     "text": ({"action": np.full(ACTION.shape, b"0.5")}, "action is no array of floats"),
-    "no action": ({"action": ...}, "action is not in it"),
+    "no action": ({"action": ...}, "action is missing"),
     "no episode": ({"configuration": CONFIGURATION[:0], "action": ACTION[:0]}, r"\(episodes, steps, 3, 1\) for robot"),
     "no step": (
         {"configuration": CONFIGURATION[:, :1], "action": ACTION[:, :0]},
@@ -103,37 +103,46 @@ WRONG = {
         r"the shape \(12, 3, 1\), expected \(ep",
     ),
     "no schema": ({"schema": ...}, "no attribute schema, expected a whole number"),
-    "schema 2": ({"schema": 2}, "schema 2, this version reads 1"),
+    "schema 3": ({"schema": 3}, "schema 3, expected 1 or 2"),
     "schema text": ({"schema": "1"}, "schema is 1, expected a whole number"),
-    "no recipe": ({"recipe": ...}, "no attribute recipe, expected JSON: robot, strategy"),
-    "recipe in Python": ({"recipe": str(RECIPE)}, "its recipe cannot be read"),
-    "recipe not text": ({"recipe": np.bytes_(b"\xff\xd8")}, "its recipe cannot be read"),
-    "recipe a number": ({"recipe": 1.5}, "its recipe cannot be read"),
-    "recipe a list": ({"recipe": [1]}, "its recipe cannot be read .*Expected `object`, got `array`"),
-    "no strategy": ({"recipe": {"robot": RECIPE["robot"]}}, "missing required field `strategy`"),
-    "strategy 1": ({"recipe": {**RECIPE, "strategy": 1}}, "Expected `str`, got `int` - at `\\$.strategy`"),
-    "no robot": ({"recipe": {"strategy": "x"}}, "missing required field `robot`"),
-    "robot a name": ({"recipe": {**RECIPE, "robot": "pneumatic-3"}}, "at `\\$.robot`"),
-    "robot of nothing": ({"recipe": {**RECIPE, "robot": {}}}, "robot cannot be read"),
+    "no generation settings": ({"generation": ...}, "no attribute generation, expected JSON: robot, strategy"),
+    "generation in Python": ({"generation": str(GENERATION)}, "its generation settings cannot be read"),
+    "generation not text": ({"generation": np.bytes_(b"\xff\xd8")}, "its generation settings cannot be read"),
+    "generation a number": ({"generation": 1.5}, "its generation settings cannot be read"),
+    "generation a list": (
+        {"generation": [1]},
+        "its generation settings cannot be read .*Expected `object`, got `array`",
+    ),
+    "no strategy": ({"generation": {"robot": GENERATION["robot"]}}, "missing required field `strategy`"),
+    "strategy 1": ({"generation": {**GENERATION, "strategy": 1}}, "Expected `str`, got `int` - at `\\$.strategy`"),
+    "no robot": ({"generation": {"strategy": "x"}}, "missing required field `robot`"),
+    "robot a name": ({"generation": {**GENERATION, "robot": "pneumatic-3"}}, "at `\\$.robot`"),
+    "robot of nothing": (
+        {"generation": {**GENERATION, "robot": {}}},
+        "robot of its generation settings cannot be read",
+    ),
     "another robot": (
-        {"recipe": {**RECIPE, "robot": robots.load("cable-4").to_dict()}},
+        {"generation": {**GENERATION, "robot": robots.load("cable-4").to_dict()}},
         r"expected \(2, 12, 4, 2\) for",
     ),
-    "other steps": ({"recipe": {**RECIPE, "steps": 150}}, "steps 150 in its recipe, but its episodes have 12"),
-    "negative steps": ({"recipe": {**RECIPE, "steps": -12}}, "steps -12 in its recipe"),
+    "other steps": (
+        {"generation": {**GENERATION, "steps": 150}},
+        "steps 150 in its generation settings, but its episodes have 12",
+    ),
+    "negative steps": ({"generation": {**GENERATION, "steps": -12}}, "steps -12 in its generation settings"),
     "other period": (
-        {"recipe": {**RECIPE, "period_s": 0.1}},
-        "period_s 0.1 in its recipe, but hz of its robot means 0.4",
+        {"generation": {**GENERATION, "period_s": 0.1}},
+        "period_s 0.1 in its generation settings, but hz of its robot means 0.4",
     ),
     "no borders": ({"stage_borders": ...}, "no attribute stage_borders"),
     "borders short": ({"stage_borders": [0, 5]}, BORDERS),
     "borders text": ({"stage_borders": "0, 12"}, BORDERS),
-    "no redrawn": ({"redrawn": ...}, "no attribute redrawn"),
-    "redrawn negative": ({"redrawn": -1}, "redrawn is -1, expected a whole number"),
-    "redrawn a fraction": ({"redrawn": 0.5}, "redrawn is 0.5, expected a whole number"),
-    "redrawn nothing": ({"redrawn": h5py.Empty("f8")}, "redrawn"),
+    "no rejected": ({"rejected": ...}, "no attribute rejected"),
+    "rejected negative": ({"rejected": -1}, "rejected is -1, expected a whole number"),
+    "rejected a fraction": ({"rejected": 0.5}, "rejected is 0.5, expected a whole number"),
+    "rejected nothing": ({"rejected": h5py.Empty("f8")}, "rejected"),
 }
-WRONG |= {
+INVALID |= {
     f"borders {value}": ({"stage_borders": np.array(value)}, BORDERS)
     for value in (
         [0, 5],
@@ -155,17 +164,32 @@ WRONG |= {
 }
 
 
-@pytest.mark.parametrize("kind", WRONG)
-def test_anything_else_is_one_line_when_it_is_read(tmp_path, kind):
-    changes, found = WRONG[kind]
+def test_schema_1_is_read_with_its_names_mapped_to_those_of_schema_2(tmp_path):
+    settings = {**GENERATION, "steps": K, "plant": "fleet-avx2", "plant_sha256": "0" * 64}
+    old = {"recipe": settings, "redrawn": 4}  # words: old names
+    path = written(tmp_path / "own.h5", schema=1, generation=..., rejected=..., **old)
+    data = dataset.read(path)
+    of_simulator = {"simulator": "fleet-avx2", "simulator_sha256": "0" * 64}
+    assert data.generation == json.loads(json.dumps({**GENERATION, "steps": K, **of_simulator}))
+    assert (data.rejected, dataset.read_header(path).rejected) == (4, 4)
+    new = written(tmp_path / "new.h5", generation={**GENERATION, "steps": K, **of_simulator}, rejected=4)
+    assert dataset.read(new).sha256() == data.sha256()
+    mixed = written(tmp_path / "mixed.h5", schema=1)
+    with pytest.raises(ModelError, match="no attribute recipe, expected JSON"):  # words: old names
+        dataset.read(mixed)
+
+
+@pytest.mark.parametrize("kind", INVALID)
+def test_invalid_data_sets_are_refused_in_one_line(tmp_path, kind):
+    changes, message = INVALID[kind]
     path = written(tmp_path / "own.h5", **changes)
-    with pytest.raises(ModelError, match=rf"^[^\n]*own\.h5: [^\n]*{found}[^\n]*$") as error:
+    with pytest.raises(ModelError, match=rf"^[^\n]*own\.h5: [^\n]*{message}[^\n]*$") as error:
         dataset.read(path)
     assert error.value.exit_code == 65
     assert len(str(error.value)) < 400
 
 
-def test_one_step_is_too_few_to_train_on(tmp_path):
+def test_data_set_of_one_step_is_too_short_to_train_on(tmp_path):
     path = written(tmp_path / "own.h5", CONFIGURATION[:, :2], ACTION[:, :1], stage_borders=np.array([0, 1]))
     with pytest.raises(ModelError, match="2 samples leave none for"):
         dataset.split(dataset.read(path), 3, "blocks", 0)
@@ -175,9 +199,9 @@ def test_one_step_is_too_few_to_train_on(tmp_path):
     ("main", "arguments"),
     [(train_cli.main, ["own.h5", "--out", "m.pt"]), (collect_cli.main, ["plot", "own.h5", "--out", "picture.png"])],
 )
-def test_the_commands_end_with_65_before_they_begin(tmp_path, monkeypatch, capsys, main, arguments):
+def test_commands_refuse_an_invalid_data_set_with_65_and_write_nothing(tmp_path, monkeypatch, capsys, main, arguments):
     monkeypatch.chdir(tmp_path)
-    written(tmp_path / "own.h5", recipe={"robot": RECIPE["robot"]})
+    written(tmp_path / "own.h5", generation={"robot": GENERATION["robot"]})
     monkeypatch.setattr(sys, "argv", ["command", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()

@@ -1,4 +1,4 @@
-"""The folder of finished episodes: a collection deletes only what a collection wrote."""
+"""The folder of finished episodes: a collection deletes only its own files."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def shards(tmp_path):
     return Shards(tmp_path / "d.h5.parts")
 
 
-def test_files_of_others_survive_the_end_of_a_collection(shards):
+def test_other_files_survive_the_end_of_a_collection(shards):
     for name in ("notes.txt", ".draft.tmp", "episode-1.npz"):
         (shards.folder / name).write_text("mine")
     with shards.held(shards.folder.with_name("d.h5")):
@@ -28,7 +28,7 @@ def test_files_of_others_survive_the_end_of_a_collection(shards):
     assert left == dict.fromkeys(("notes.txt", ".draft.tmp", "episode-1.npz"), "mine")
 
 
-def test_a_folder_without_other_files_is_deleted(shards):
+def test_folder_without_other_files_is_deleted(shards):
     with shards.held(shards.folder.with_name("d.h5")):
         shards.open({"seed": 1})
         shards.write(0, EPISODE)
@@ -36,8 +36,13 @@ def test_a_folder_without_other_files_is_deleted(shards):
     assert list(shards.folder.parent.iterdir()) == []
 
 
-def test_episodes_without_a_recipe_are_not_those_of_a_collection(shards):
+@pytest.mark.parametrize("old", [False, True])
+def test_episodes_without_their_settings_are_refused(shards, old):
+    if old:
+        (shards.folder / "recipe.json").write_text('{"seed": 1}')  # words: old names
     (shards.folder / "episode-000000.npz").write_text("mine")
-    with pytest.raises(ModelError, match="episodes without the recipe of modsoft-collect"):
+    with pytest.raises(
+        ModelError, match=r"d\.h5\.parts: episodes without generation\.json, of another version of modsoft"
+    ):
         shards.open({"seed": 1})
     assert (shards.folder / "episode-000000.npz").read_text() == "mine"

@@ -83,7 +83,7 @@ def test_a_robot_that_goes_non_finite_in_the_fleet_is_dropped_and_drawn_again(tm
         made[name] = collect.collect(robot, tmp_path / name, 8 * steps, "random", 2, steps)
     clean, found = (dataset.read(tmp_path / name) for name in made)
     assert len(planted) == 1
-    assert (made["clean"].redrawn, made["planted"].redrawn) == (0, 1)
+    assert (made["clean"].rejected, made["planted"].rejected) == (0, 1)
     assert np.isfinite(found.configuration).all()
     others = [index for index in range(8) if index != victim]
     np.testing.assert_array_equal(found.configuration[others], clean.configuration[others])
@@ -149,13 +149,13 @@ def test_a_killed_collection_of_the_real_robot_gives_the_same_file(tmp_path):
     assert again.returncode == 0, again.stderr
     assert "killed.h5: 12800 samples in 32 episodes" in again.stdout
     assert (tmp_path / "killed.h5").read_bytes() == (tmp_path / "straight.h5").read_bytes()
-    assert dataset.read(tmp_path / "killed.h5").redrawn == 0
+    assert dataset.read(tmp_path / "killed.h5").rejected == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["killed.h5", "straight.h5"]
     other = subprocess.run(
         command(*asked[:-1], "5", "--out", "killed.h5"), cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert other.returncode == 65
-    assert "begun with seed 4, asked for 5" in other.stderr
+    assert "begun with seed 4, expected 5" in other.stderr
     assert other.stderr.count("\n") == 1
 
 

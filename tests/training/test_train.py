@@ -28,11 +28,11 @@ def make(episodes: int = 10, steps: int = 30, seed: int = 0) -> dataset.DataSet:
     angles = np.zeros((episodes, steps + 1, 3))
     angles[:, 1:] = 40 * action[..., 0] - 10 * np.roll(action[..., 0], -1, axis=-1)
     return dataset.DataSet(
-        recipe={"robot": robot.to_dict(), "strategy": "random", "seed": seed, "steps": steps},
+        generation={"robot": robot.to_dict(), "strategy": "random", "seed": seed, "steps": steps},
         configuration=from_angles_deg(angles),
         action=action,
         stage_borders=np.array([0, steps]),
-        redrawn=0,
+        rejected=0,
     )
 
 
@@ -356,14 +356,14 @@ def test_several_data_sets_of_one_robot_train_one_model(tmp_path):
     assert found["samples"] == 450
     assert found["windows"] == list(np.sum([each["windows"] for each in alone], axis=0))
     assert len({found["data_sha256"], *(each["data_sha256"] for each in alone)}) == 3
-    assert [recipe["seed"] for recipe in found["recipes"]] == [0, 1]
+    assert [generation["seed"] for generation in found["generation"]] == [0, 1]
     swapped = train.train(data[::-1], tmp_path / "swapped.pt", SMALL)["provenance"]
     assert swapped["data_sha256"] != found["data_sha256"]
 
 
 def test_data_sets_of_different_robots_are_refused(tmp_path):
     other = make()
-    other.recipe["robot"]["limits"]["largest_actuation_step"] = 0.9
+    other.generation["robot"]["limits"]["largest_actuation_step"] = 0.9
     with pytest.raises(ModelError, match=r"different robots, pneumatic-3 and pneumatic-3 \(or of one"):
         train.train([make(), other], tmp_path / "model.pt", SMALL)
 

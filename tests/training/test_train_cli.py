@@ -40,8 +40,8 @@ def folder(tmp_path):
     robot = robots.load("pneumatic-2")
     action = np.random.default_rng(0).uniform(-1, 1, (10, 20, 2, 1))
     angles = np.concatenate([np.zeros((10, 1, 2)), 40 * action[..., 0]], axis=1)
-    recipe = {"robot": robot.to_dict(), "strategy": "random", "seed": 0, "steps": 20}
-    dataset.write(dataset.DataSet(recipe, from_angles_deg(angles), action, np.array([0, 20]), 0), tmp_path / "d.h5")
+    generation = {"robot": robot.to_dict(), "strategy": "random", "seed": 0, "steps": 20}
+    dataset.write(dataset.DataSet(generation, from_angles_deg(angles), action, np.array([0, 20]), 0), tmp_path / "d.h5")
     return tmp_path
 
 

@@ -96,7 +96,7 @@ def compare(paths: list[Path]) -> list[Coverage]:
         reached = data.configuration[:, 1:].reshape(-1, modules, 3)
         evenly = np.linspace(0, len(reached) - 1, samples).round().astype(np.int64)
         positions = module_ends(reached[evenly], length_m)
-        strategy = str(data.recipe["strategy"])
+        strategy = str(data.generation["strategy"])
         found.append(Coverage(path.name, strategy, planar, positions, covered(positions, length_m, planar)))
     return found
 

@@ -1,11 +1,13 @@
-"""The data set: one HDF5 file of episodes, and the windows that a network learns from.
+"""The data set: one HDF5 file of episodes, and the windows that a network is trained on.
 
     configuration   (E, K + 1, N, 3) [v_x, v_y, v_z], row 0 at rest, row t + 1 reached by the action of row t
     action          (E, K, N, A) in [-1, 1]
 
-Attributes: `schema` (1), `recipe` (JSON; all that the numbers depend on: at least `robot`, the robot file as plain
-values, and `strategy`, text), `stage_borders` (stages + 1 steps, 0 to K), `redrawn` (episodes that were not finite and
-were drawn again). What a data set means is checked when it is read: `dataset_checks`.
+Attributes: `schema` (2); `generation` (JSON: the settings that all numbers depend on; at least `robot`, the robot file
+as plain values, and `strategy`, text; `simulator` and `simulator_sha256`, name and parameters, for simulated data);
+`stage_borders` (stages + 1 steps, 0 to K); `rejected` (episodes that diverged and were replaced; 0 for a real robot).
+The meaning of the numbers is checked at reading (`dataset_checks`). Files of schema 1, with other names of attributes
+(`dataset_checks.SCHEMA_1`), are read too.
 """
 
 from __future__ import annotations
@@ -32,8 +34,8 @@ from modsoft.runtime.robot import Robot
 from modsoft.training.data import dataset_checks as checks
 from modsoft.training.data.hdf5 import own_array
 
-SCHEMA = 1
-# Shares of training, validation and test, as in the paper (70/10/20); these are where the second and third begin.
+SCHEMA = 2
+# Training, validation and test part have 70, 10 and 20 %, as in the paper; the second and third begin here.
 VALIDATION_FROM, TEST_FROM = 0.7, 0.8
 
 
@@ -41,15 +43,15 @@ VALIDATION_FROM, TEST_FROM = 0.7, 0.8
 class DataSet:
     """Episodes of one robot, all of the same length and each from rest."""
 
-    recipe: dict[str, Any]  # schema, robot, strategy, seed, steps, period_s, plant_sha256, code_version
+    generation: dict[str, Any]  # schema, robot, strategy, seed, steps, period_s, simulator, code_version, ...
     configuration: Array  # (E, K + 1, N, 3)
     action: Array  # (E, K, N, A)
     stage_borders: NDArray[np.int64]  # (stages + 1,), 0 to K
-    redrawn: int
+    rejected: int
 
     @property
     def robot(self) -> Robot:
-        return robots.from_dict(self.recipe["robot"], "data set")
+        return robots.from_dict(self.generation["robot"], "data set")
 
     @property
     def samples(self) -> int:
@@ -57,8 +59,8 @@ class DataSet:
         return self.action.shape[0] * self.action.shape[1]
 
     def sha256(self) -> str:
-        """Of recipe and numbers, so that a model can say what it was trained on."""
-        digest = hashlib.sha256(json.dumps(self.recipe, sort_keys=True).encode())
+        """Of settings and numbers; a model records it for each data set that it was trained on."""
+        digest = hashlib.sha256(json.dumps(self.generation, sort_keys=True).encode())
         for array in (self.configuration, self.action, self.stage_borders):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
@@ -69,7 +71,7 @@ class Episode(NamedTuple):
 
     configuration: Array  # (K + 1, N, 3)
     action: Array  # (K, N, A)
-    redrawn: int = 0  # how often it had been drawn before without staying finite
+    rejected: int = 0  # attempts before this one in which the robot diverged
 
     def is_finite(self) -> bool:
         return bool(np.isfinite(self.configuration).all() and np.isfinite(self.action).all())
@@ -77,11 +79,11 @@ class Episode(NamedTuple):
 
 @dataclass(frozen=True)
 class Header:
-    """What a data set says about itself without its numbers."""
+    """The attributes of a data set, and its number of episodes."""
 
-    recipe: dict[str, Any]
+    generation: dict[str, Any]
     stage_borders: NDArray[np.int64]
-    redrawn: int
+    rejected: int
     episodes: int
 
     @property
@@ -91,17 +93,17 @@ class Header:
 
 
 def write(data: DataSet, path: Path) -> None:
-    """Writes beside `path` and renames. The same data give the same bytes."""
-    redrawn = itertools.chain([data.redrawn], itertools.repeat(0))
-    episodes = map(Episode, data.configuration, data.action, redrawn)
-    join(path, data.recipe, data.stage_borders, len(data.action), episodes)
+    """Writes to a temporary file beside `path` and renames it. The same data give the same bytes."""
+    rejected = itertools.chain([data.rejected], itertools.repeat(0))
+    episodes = map(Episode, data.configuration, data.action, rejected)
+    join(path, data.generation, data.stage_borders, len(data.action), episodes)
 
 
 def join(
-    path: Path, recipe: dict[str, Any], stage_borders: NDArray[np.int64], count: int, episodes: Iterable[Episode]
+    path: Path, generation: dict[str, Any], stage_borders: NDArray[np.int64], count: int, episodes: Iterable[Episode]
 ) -> Header:
-    """`write` for `count` episodes that come one after the other and are never in memory together."""
-    redrawn = 0
+    """`write` for `count` episodes from an iterator, one in memory at a time."""
+    rejected = 0
     with written(path) as temporary:
         try:
             with h5py.File(temporary, "w") as file:
@@ -109,57 +111,57 @@ def join(
                     if index == 0:
                         for name in ("configuration", "action"):
                             file.create_dataset(name, (count, *getattr(episode, name).shape), np.float64)
-                    if not episode.is_finite():  # the last door: none may get here
+                    if not episode.is_finite():  # the last check; earlier ones keep such episodes away
                         raise ModelError(f"episode {index} is not finite; not written to {path}")
                     file["configuration"][index] = episode.configuration
                     file["action"][index] = episode.action
-                    redrawn += episode.redrawn
+                    rejected += episode.rejected
                 file.attrs["schema"] = SCHEMA
-                file.attrs["recipe"] = json.dumps(recipe, sort_keys=True)
+                file.attrs["generation"] = json.dumps(generation, sort_keys=True)
                 file.attrs["stage_borders"] = stage_borders
-                file.attrs["redrawn"] = redrawn
-        except RuntimeError as error:  # what h5py makes of a disk that is full when it closes the file
+                file.attrs["rejected"] = rejected
+        except RuntimeError as error:  # h5py's error for a full disk when it closes the file
             raise OSError(" ".join(str(error).split())) from error
-    return Header(recipe, stage_borders, redrawn, count)
+    return Header(generation, stage_borders, rejected, count)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[dict[str, h5py.Dataset], Header]]:
-    """The arrays of a data set, not read yet, and what it reports about itself, checked against their shapes."""
+    """The arrays of a data set, not read yet, and its attributes, checked against the arrays' shapes."""
     check_is_file(path, "data set", f"modsoft-collect --out {path} makes one")
     try:
         with h5py.File(path, "r") as file:
-            told = checks.attributes(file.attrs, path)
-            schema = checks.whole_number("schema", told["schema"], path)
-            if schema != SCHEMA:
-                raise ModelError(f"{path}: schema {schema}, this version reads {SCHEMA}; collect it again")
+            attributes = checks.attributes(file.attrs, SCHEMA, path)
             arrays = {name: own_array(file, name) for name in ("configuration", "action")}
             shape = arrays["action"].shape
             steps = shape[1] if len(shape) == 4 else 0
-            recipe = checks.recipe(told["recipe"], steps, path)
-            robot = robots.from_dict(recipe["robot"], "data set")
+            generation = checks.generation(attributes["generation"], steps, path)
+            robot = robots.from_dict(generation["robot"], "data set")
             checks.shapes(arrays["configuration"].shape, shape, robot, path)
-            borders = checks.stage_borders(told["stage_borders"], steps, path)
-            redrawn = checks.whole_number("redrawn", told["redrawn"], path)
-            yield arrays, Header(recipe, borders, redrawn, episodes=shape[0])
+            borders = checks.stage_borders(attributes["stage_borders"], steps, path)
+            rejected = checks.whole_number("rejected", attributes["rejected"], path)
+            yield arrays, Header(generation, borders, rejected, episodes=shape[0])
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise ModelError(f"{path}: not a data set of modsoft-collect, or damaged ({error})") from error
 
 
 def read_header(path: Path) -> Header:
-    """Reads what a data set reports about itself; errors as in `read`."""
+    """Reads the attributes of a data set; errors as in `read`."""
     with _opened(path) as (_, header):
         return header
 
 
 def read(path: Path) -> DataSet:
-    """Reads a data set of any float type; `ModelError` says what was found where it is none, is damaged, or means
-    something else: configurations that are no unit vectors, actions beyond [-1, 1]."""
+    """Reads a data set of any float type.
+
+    Raises `ModelError` for any other file, a damaged one, and numbers with another meaning: configurations that are no
+    unit vectors, actions outside [-1, 1].
+    """
     with _opened(path) as (arrays, header):
         configuration, action = (np.asarray(arrays[name], np.float64) for name in ("configuration", "action"))
     checks.configuration(configuration, path)
     checks.action(action, path)
-    return DataSet(header.recipe, configuration, action, header.stage_borders, header.redrawn)
+    return DataSet(header.generation, configuration, action, header.stage_borders, header.rejected)
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,7 @@ class Windows:
         return parts[0] if len(parts) == 1 else Windows(np.concatenate(features), np.concatenate(targets))
 
     def evenly(self, most: int) -> Windows:
-        """At most `most` of them, spread evenly."""
+        """At most `most` of them, evenly spread."""
         every = -(-len(self) // most)
         return Windows(self.features[::every], self.targets[::every])
 
@@ -186,8 +188,9 @@ class Windows:
 def split(data: DataSet, history: int, how: str, seed: int) -> tuple[Windows, Windows, Windows]:
     """Training, validation and test windows, 70/10/20.
 
-    how: "blocks" cuts contiguous blocks of time and drops every window that reaches over a cut; "shuffled" deals
-    single windows at random as the paper does, which leaks, since neighbouring windows share most of their content.
+    how: "blocks" cuts contiguous blocks of time and drops every window that extends over a cut; "shuffled" assigns
+    single windows at random, as in the paper. Neighbouring windows share most of their content, so that information of
+    the test part leaks into training.
     """
     kind = data.robot.kind
     states = state_of(data.configuration, kind)
@@ -205,24 +208,24 @@ def split(data: DataSet, history: int, how: str, seed: int) -> tuple[Windows, Wi
 
 def _shuffled_parts(data: DataSet, seed: int) -> NDArray[np.int64]:
     """Part (E, K) of every window: 0, 1 or 2."""
-    place = np.random.default_rng(seed).permutation(data.samples) / data.samples
-    return np.digitize(place, [VALIDATION_FROM, TEST_FROM]).reshape(data.action.shape[:2])
+    position = np.random.default_rng(seed).permutation(data.samples) / data.samples
+    return np.digitize(position, [VALIDATION_FROM, TEST_FROM]).reshape(data.action.shape[:2])
 
 
 def _block_parts(data: DataSet, history: int) -> NDArray[np.int64]:
-    """Part (E, K) of every window, -1 for those dropped.
+    """Part (E, K) of every window, -1 for dropped ones.
 
-    Each stage is cut on its own, all episodes' pieces of it laid end to end: so every part holds every stage in its
-    share, with one long run of a real robot as with many short simulated ones.
+    Each stage is cut on its own, with its pieces of all episodes in a row. So every part has the same fraction of every
+    stage, with one long run of a real robot as with many short simulated ones.
     """
     episodes, steps = data.action.shape[:2]
     borders = data.stage_borders
     stage = np.searchsorted(borders, np.arange(steps), side="right") - 1
     length = np.diff(borders)[stage]
-    place = (np.arange(episodes)[:, None] * length + np.arange(steps) - borders[stage]) / (episodes * length)
-    part = np.digitize(place, [VALIDATION_FROM, TEST_FROM])
-    # The window of step t reaches back to the action of step t - history.
-    whole = np.ones_like(part, dtype=bool)
+    position = (np.arange(episodes)[:, None] * length + np.arange(steps) - borders[stage]) / (episodes * length)
+    part = np.digitize(position, [VALIDATION_FROM, TEST_FROM])
+    # The window of step t extends back to the action of step t - history.
+    is_whole = np.ones_like(part, dtype=bool)
     for back in range(1, history + 1):
-        whole[:, back:] &= part[:, back:] == part[:, :-back]
-    return np.where(whole, part, -1)
+        is_whole[:, back:] &= part[:, back:] == part[:, :-back]
+    return np.where(is_whole, part, -1)

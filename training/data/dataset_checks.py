@@ -1,12 +1,13 @@
-"""What a data set has to mean, checked when it is read: users write their own, from the logs of real robots.
+"""Checks of a data set at reading: users write their own, from the logs of real robots.
 
-Each function raises `ModelError` in one line that names the place, what was found and what was expected.
+Each function raises `ModelError` in one line with the place, what was found and what was expected.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,19 @@ from modsoft.runtime.files import decoded
 
 ATTRIBUTES = {
     "schema": "a whole number",
-    "recipe": "JSON: robot, strategy, ...",
+    "generation": "JSON: robot, strategy, ...",
     "stage_borders": "whole numbers from 0 to the steps of an episode",
-    "redrawn": "a whole number, 0 for a real robot",
+    "rejected": "a whole number, 0 for a real robot",
 }
-LENGTH_TOLERANCE = 1e-3  # of a unit vector: room for half precision and for numbers with four decimals
-RANGE_TOLERANCE = 1e-6  # of an action beyond [-1, 1]: room for the rounding of single precision
+# Names of schema 1, and those of schema 2 for the same: attributes, and keys of the generation settings.
+SCHEMA_1 = {"recipe": "generation", "redrawn": "rejected"}  # words: old names
+SCHEMA_1_SETTINGS = {"plant": "simulator", "plant_sha256": "simulator_sha256"}
+LENGTH_TOLERANCE = 1e-3  # of a unit vector: allows half precision and numbers with four decimals
+RANGE_TOLERANCE = 1e-6  # of an action beyond [-1, 1]: allows the rounding of single precision
 
 
-class Recipe(msgspec.Struct):
-    """The part of a recipe that every data set has; collected ones have more."""
+class Generation(msgspec.Struct):
+    """The generation settings that every data set has; collected ones have more."""
 
     robot: dict[str, Any]
     strategy: str
@@ -39,14 +43,20 @@ class Recipe(msgspec.Struct):
     period_s: float | None = None
 
 
-def attributes(found: Any, where: Path) -> dict[str, Any]:
-    """All of `ATTRIBUTES` out of those of a file."""
-    missing = [name for name in ATTRIBUTES if name not in found]
-    if missing:
-        raise ModelError(
-            f"{where}: not a data set of modsoft-collect: no attribute {missing[0]}, expected {ATTRIBUTES[missing[0]]}"
-        )
-    return {name: found[name] for name in ATTRIBUTES}
+def attributes(found: Mapping[str, Any], schema: int, where: Path) -> dict[str, Any]:
+    """All of `ATTRIBUTES` of a file of this schema, or of schema 1, under their present names."""
+    is_old = "schema" in found and whole_number("schema", found["schema"], where) == 1
+    old_names = {new: old for old, new in SCHEMA_1.items()} if is_old else {}
+    names = {name: old_names.get(name, name) for name in ATTRIBUTES}
+    for name, name_in_file in names.items():
+        if name_in_file not in found:
+            raise ModelError(
+                f"{where}: not a data set of modsoft-collect: no attribute {name_in_file}, expected {ATTRIBUTES[name]}"
+            )
+    of_file = whole_number("schema", found["schema"], where)
+    if of_file not in (1, schema):
+        raise ModelError(f"{where}: schema {of_file}, expected 1 or {schema}; collect it again, or update modsoft")
+    return {name: found[name_in_file] for name, name_in_file in names.items()}
 
 
 def whole_number(name: str, value: Any, where: Path) -> int:
@@ -57,24 +67,30 @@ def whole_number(name: str, value: Any, where: Path) -> int:
     return int(array.item())
 
 
-def recipe(value: Any, steps: int, where: Path) -> dict[str, Any]:
-    """The recipe, which fits episodes of `steps` control steps, and whose robot can be read."""
+def generation(value: Any, steps: int, where: Path) -> dict[str, Any]:
+    """The generation settings, under their present names; they fit episodes of `steps` control steps, and their robot
+    can be read."""
     try:
         text = decoded(value) if isinstance(value, bytes) else value
         found = json.loads(text)
-        said = msgspec.convert(found, Recipe)
+        required = msgspec.convert(found, Generation)
     except (ValueError, TypeError, RecursionError, msgspec.ValidationError) as error:
-        raise ModelError(f"{where}: its recipe cannot be read ({error}); expected {ATTRIBUTES['recipe']}") from error
+        raise ModelError(
+            f"{where}: its generation settings cannot be read ({error}); expected {ATTRIBUTES['generation']}"
+        ) from error
     try:
-        robot = robots.from_dict(said.robot, "robot")
-    except RobotFileError as error:  # of this file, not of a robot file that the user can mend
-        raise ModelError(f"{where}: its recipe's robot cannot be read ({error})") from error
-    if said.steps not in (None, steps):
-        raise ModelError(f"{where}: steps {said.steps} in its recipe, but its episodes have {steps}")
+        robot = robots.from_dict(required.robot, "robot")
+    except RobotFileError as error:  # of this file, not of a robot file that the user can edit
+        raise ModelError(f"{where}: the robot of its generation settings cannot be read ({error})") from error
+    if required.steps not in (None, steps):
+        raise ModelError(f"{where}: steps {required.steps} in its generation settings, but its episodes have {steps}")
     period_s = robot.loop.period_s
-    if said.period_s is not None and not math.isclose(said.period_s, period_s, rel_tol=1e-6):
-        raise ModelError(f"{where}: period_s {said.period_s:g} in its recipe, but hz of its robot means {period_s:g}")
-    return found
+    if required.period_s is not None and not math.isclose(required.period_s, period_s, rel_tol=1e-6):
+        raise ModelError(
+            f"{where}: period_s {required.period_s:g} in its generation settings, but hz of its robot means "
+            f"{period_s:g}"
+        )
+    return {SCHEMA_1_SETTINGS.get(name, name): setting for name, setting in found.items()}
 
 
 def stage_borders(value: Any, steps: int, where: Path) -> NDArray[np.int64]:

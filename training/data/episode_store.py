@@ -1,8 +1,8 @@
-"""The folder of finished episodes beside an unfinished data set: all that a restarted collection goes on from.
+"""The folder of finished episodes beside an unfinished data set, from which an interrupted collection resumes.
 
-Every episode is one file, under its final name only when whole; any number of workers on any number of machines that
-share the folder may write to it. Two that make the same episode write the same numbers. One collection at a time deals
-out the work, joins and clears away.
+Every episode is one file, which gets its final name when it is complete. Any number of workers may write to the folder,
+on all machines that share it; two workers with the same episode write the same numbers. One collection at a time
+dispatches the work, joins the episodes and deletes them.
 """
 
 from __future__ import annotations
@@ -26,51 +26,58 @@ from modsoft.runtime.locks import locked
 from modsoft.training.data.dataset import Episode
 
 EPISODE = re.compile(r"episode-([0-9]{6}|[1-9][0-9]{6,8})\.npz")
-STALE = re.compile(r"\.(episode-[0-9]+\.npz|recipe\.json)\..*\.tmp")
+STALE = re.compile(r"\.(episode-[0-9]+\.npz|generation\.json)\..*\.tmp")
+SETTINGS = "generation.json"
 JOBS = re.compile(r"jobs-[0-9a-f]{32}")  # of `backends.by_submitit`
 
 
 @dataclass(frozen=True)
 class Shards:
-    """folder: `OUT.parts`. It goes to other processes as it is."""
+    """folder: `OUT.parts`. Other processes receive it pickled."""
 
     folder: Path
 
     def held(self, out: Path) -> AbstractContextManager[None]:
-        """The folder and the data set `out` for this collection alone; `InUse` while another one has them."""
+        """Locks the folder and the data set `out` for this collection; `InUse` while another one holds them."""
         return locked(out.with_name(f"{out.name}.lock"), out, "modsoft-collect")
 
     def refuse_link(self) -> None:
-        """`ModelError` where the folder is a link: it would be cleared away, or written to, wherever it is."""
+        """`ModelError` where the folder is a link: files elsewhere would be overwritten or deleted."""
         if self.folder.is_symlink():
-            raise ModelError(f"{self.folder}: a link, expected what modsoft-collect makes; choose another --out")
+            raise ModelError(f"{self.folder}: a link, expected a folder of modsoft-collect; choose another --out")
 
-    def open(self, recipe: dict[str, Any]) -> None:
-        """Begins in the folder, or checks that what is there belongs to the same recipe (`ModelError`)."""
+    def open(self, generation: dict[str, Any]) -> None:
+        """Creates the folder, or checks that its episodes have the same generation settings (`ModelError`)."""
         self.refuse_link()
         try:
             self.folder.mkdir(exist_ok=True)
         except OSError as error:
-            raise OutputError(f"{self.folder}: cannot be made ({error.strerror}); choose another --out") from error
+            raise OutputError(f"{self.folder}: cannot be created ({error.strerror}); choose another --out") from error
         for stale in self.folder.iterdir():
             if STALE.fullmatch(stale.name):  # of a process that was killed while it wrote
                 self._drop(stale)
-        told = self.folder / "recipe.json"
-        if told.is_file():
+        settings = self.folder / SETTINGS
+        if settings.is_file():
             try:
-                found = json.loads(told.read_bytes())  # bytes: JSON tells its encoding itself
+                found = json.loads(settings.read_bytes())  # JSON detects its encoding
             except (OSError, ValueError, RecursionError) as error:
-                raise ModelError(f"{told}: cannot be read ({error}); delete its folder to start anew") from error
-            refuse_other(found, recipe, self.folder)
+                raise ModelError(f"{settings}: cannot be read ({error}); delete its folder to start again") from error
+            refuse_other(found, generation, self.folder)
             return
         if self.finished():
-            raise ModelError(f"{self.folder}: episodes without the recipe of modsoft-collect; choose another --out")
-        with written(told, through_links=False) as temporary:
-            temporary.write_text(json.dumps(recipe, indent=1), encoding="utf-8")
+            raise ModelError(
+                f"{self.folder}: episodes without {SETTINGS}, of another version of modsoft; give another --out, or "
+                "delete it"
+            )
+        with written(settings, through_links=False) as temporary:
+            temporary.write_text(json.dumps(generation, indent=1), encoding="utf-8")
 
     def finished(self) -> set[int]:
-        """Indices of the episodes that are there. The folder is listed rather than asked for single files, for a
-        network file system would go on denying a file that it was asked for before another machine wrote it."""
+        """Indices of the finished episodes.
+
+        Lists the folder: a network file system caches that a file does not exist, and reports the same after another
+        machine has written it.
+        """
         return {int(found[1]) for name in os.listdir(self.folder) if (found := EPISODE.fullmatch(name))}
 
     def drop_damaged(self, configuration: tuple[int, ...], action: tuple[int, ...]) -> None:
@@ -80,7 +87,7 @@ class Shards:
                 episode = self.read(index)
                 is_sound = (episode.configuration.shape, episode.action.shape) == (configuration, action)
                 is_sound = is_sound and episode.is_finite()
-            except (ModelError, TypeError):  # what numpy says to arrays of text
+            except (ModelError, TypeError):  # numpy's error for arrays of text
                 is_sound = False
             if not is_sound:
                 self._drop(self.path(index))
@@ -89,7 +96,7 @@ class Shards:
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
-            raise OutputError(f"{path}: no whole episode, and cannot be deleted ({error.strerror})") from error
+            raise OutputError(f"{path}: not a complete episode, and cannot be deleted ({error.strerror})") from error
 
     def path(self, index: int) -> Path:
         return self.folder / f"episode-{index:06}.npz"
@@ -100,11 +107,11 @@ class Shards:
             raise ModelError(f"{path}: a link, expected an episode; delete it")
         try:
             with np.load(path, allow_pickle=False) as file:
-                return Episode(file["configuration"], file["action"], int(file["redrawn"]))
+                return Episode(file["configuration"], file["action"], int(file["rejected"]))
         except (OSError, KeyError, TypeError, BadZipFile, *NOT_AN_ARRAY) as error:
             why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged, or another format"
             raise ModelError(
-                f"{path}: no whole episode ({why}); every worker must share this folder, run again to make it"
+                f"{path}: not a complete episode ({why}); every worker must share this folder, run again to replace it"
             ) from error
 
     def write(self, index: int, episode: Episode) -> None:
@@ -112,8 +119,8 @@ class Shards:
             np.savez(file, **episode._asdict())
 
     def remove(self) -> None:
-        """Takes the folder away at one stroke; a worker still at work for a killed collection finds it gone. Where
-        others put files there, it deletes what a collection wrote and leaves the rest."""
+        """Deletes the folder atomically, so that a remaining worker of a killed collection cannot write to it any more.
+        Where it contains other files, only those of a collection are deleted."""
         self.refuse_link()
         if not self.folder.exists():
             return
@@ -127,22 +134,23 @@ class Shards:
                 os.replace(self.folder, trash)
             except OSError as error:  # Windows refuses while a file in it is open
                 raise OutputError(
-                    f"{self.folder}: cannot be deleted ({error.strerror}); the data set is whole, delete it yourself"
+                    f"{self.folder}: cannot be deleted ({error.strerror}); the data set is complete, delete the folder "
+                    "yourself"
                 ) from error
             shutil.rmtree(trash, ignore_errors=True)
 
 
 def _is_own(name: str) -> bool:
-    return name in ("lock", "recipe.json") or any(each.fullmatch(name) for each in (EPISODE, STALE, JOBS))
+    return name in ("lock", SETTINGS) or any(each.fullmatch(name) for each in (EPISODE, STALE, JOBS))
 
 
-def refuse_other(found: dict[str, Any], recipe: dict[str, Any], where: Path) -> None:
-    """`ModelError` that names the first difference of two recipes."""
+def refuse_other(found: dict[str, Any], generation: dict[str, Any], where: Path) -> None:
+    """`ModelError` with the first difference of two generation settings."""
     if not isinstance(found, dict):
-        raise ModelError(f"{where}: begun with a recipe that is none; give another --out, or delete it")
-    differences = [key for key in recipe if found.get(key) != recipe[key]]
+        raise ModelError(f"{where}: its generation settings cannot be read; give another --out, or delete it")
+    differences = [key for key in generation if found.get(key) != generation[key]]
     if differences:
         key = differences[0]
-        is_short = not isinstance(recipe[key], dict)
-        what = f"{key} {found.get(key)}, asked for {recipe[key]}" if is_short else f"another {key}"
+        is_short = not isinstance(generation[key], dict)
+        what = f"{key} {found.get(key)}, expected {generation[key]}" if is_short else f"another {key}"
         raise ModelError(f"{where}: begun with {what}; give another --out, or delete it")

@@ -1,7 +1,7 @@
-"""Work dealt out to processes, with a pipe to each and one back.
+"""Dispatches work to processes, with a pipe to each and one back.
 
-A worker whose parent is gone finds its pipe closed and ends after the item in hand; concurrent.futures leaves
-such workers waiting for ever, which a collection that may be killed at any time cannot afford.
+When the parent dies, a worker's pipe is closed, and the worker ends after its present item. The workers of
+concurrent.futures would wait indefinitely; a collection may be killed at any time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from modsoft.runtime.errors import INTERNAL_EXIT_CODE, ModsoftError
 
 Item = TypeVar("Item")
 
-# Windows waits for at most 63 things at a time, and multiprocessing uses some itself.
+# Windows waits for at most 63 objects at a time, and multiprocessing needs some of them.
 MOST_JOBS = 60 if os.name == "nt" else 10_000
 
 
@@ -29,22 +29,22 @@ class WorkerLost(ModsoftError):
 
 
 def run(task: Callable[[Item], None], items: list[Item], jobs: int) -> Iterator[Item]:
-    """Runs task(item) for every item and gives each item as it is done, in no certain order. jobs = 1: in this
-    process. An error in a worker is raised here; the other workers are ended."""
+    """Runs task(item) for every item and yields each finished item, in any order. jobs = 1: in this process. An error
+    in a worker is raised here, and the other workers are ended."""
     if jobs == 1 or len(items) <= 1:
         for item in items:
             task(item)
             yield item
         return
     waiting = iter(items)
-    # spawn: a fork would copy the locks of whatever threads run here
+    # spawn: a fork would copy locks that other threads of this process hold
     context = multiprocessing.get_context("spawn")
     processes = []
-    busy: dict[Connection, Connection] = {}  # where a worker's answers come from: where its items go
+    busy: dict[Connection, Connection] = {}  # pipe from a worker: pipe to it
     try:
         with _environment():
             for _ in range(min(jobs, len(items), MOST_JOBS)):
-                # one-way pipes: a pair for both ways is a socket of a kind that not every system has
+                # one-way pipes: a two-way pipe is a kind of socket that not every system has
                 its_items, to_worker = context.Pipe(duplex=False)
                 from_worker, its_answers = context.Pipe(duplex=False)
                 process = context.Process(target=_work, args=(task, its_items, its_answers), daemon=True)
@@ -90,27 +90,27 @@ def _lost_if_broken() -> Iterator[None]:
     try:
         yield
     except (EOFError, BrokenPipeError, ConnectionResetError):
-        raise WorkerLost("a worker process died (killed, or out of memory); run again to go on") from None
+        raise WorkerLost("a worker process died (killed, or out of memory); run again to resume") from None
 
 
 def _work(task: Callable[[Any], None], items: Connection, answers: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is sent to all processes; the parent handles it
     try:
         while True:
             item = items.recv()
             try:
                 task(item)
-            except Exception as error:  # noqa: BLE001 - raised again by the parent, whatever it is
+            except Exception as error:  # noqa: BLE001 - raised again by the parent
                 answers.send(error)
                 return
             answers.send(item)
-    except (EOFError, BrokenPipeError):  # the parent is gone or has no more
+    except (EOFError, BrokenPipeError):  # the parent has died or has no more items
         return
 
 
 @contextmanager
 def _environment() -> Iterator[None]:
-    """For processes started inside: a core each, no threads within, and no imports from the current folder."""
+    """Environment of the workers: one thread each, and no imports from the current folder."""
     names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PYTHONSAFEPATH")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))
