@@ -125,11 +125,11 @@ def mutants() -> list[Mutant]:
     return list(mutant_of.values())
 
 
-def equivalents() -> dict[str, str]:
+def equivalents(file: Path = EQUIVALENT) -> dict[str, str]:
     """Return the reason of each equivalent mutant by its name."""
     listed: dict[str, str] = {}
     name = ""
-    for line in EQUIVALENT.read_text().splitlines():
+    for line in file.read_text().splitlines():
         if line.startswith("    "):
             listed[name] = (listed[name] + " " + line.strip()).strip()
         elif line.strip() and not line.startswith("#"):

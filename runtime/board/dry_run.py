@@ -1,4 +1,4 @@
-"""Replacement of the board in a dry run."""
+"""What stands in for the board in a dry run: set-points go nowhere, and nothing is said to be vented."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS, Status
 
 
-class DryRunBoard:
-    """Discards set-points; never reports a status."""
+class Rehearsal:
+    """No valve moves; everything else of the loop is as in a run."""
 
     status: Status | None = None
     status_age_s = float("nan")
@@ -21,10 +21,10 @@ class DryRunBoard:
         self.statistics: dict[str, int] = {}
 
     def check(self) -> None:
-        """Always passes."""
+        """Nothing can be lost."""
 
     def set_pressures(self, tick: int, pressures_bar: Array) -> int:
         return tick & 0xFF
 
     def publish_tick(self, tick: int) -> None:
-        """Has no effect."""
+        """Nobody listens."""

@@ -7,8 +7,19 @@ import serial
 
 from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.runtime.board import protocol
-from modsoft.runtime.board.codec import Parser, encode
-from modsoft.runtime.board.protocol import Arm, ClearFault, Heartbeat, Hello, HelloReq, Set, State, Status, Vent
+from modsoft.runtime.board.protocol import (
+    Arm,
+    ClearFault,
+    Heartbeat,
+    Hello,
+    HelloReq,
+    Parser,
+    Set,
+    State,
+    Status,
+    Vent,
+    encode,
+)
 
 BAUD = 250_000
 HEARTBEAT_S = 0.1

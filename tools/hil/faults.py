@@ -212,7 +212,7 @@ FAULTS = [
         None,
         counted("missed_acks", "refused"),
         LOST,
-        "not acknowledged|no STATUS|received nothing",
+        "not acknowledged|no word|did not hear",
     ),
     Fault(
         "bytes dropped towards the board",
@@ -222,7 +222,7 @@ FAULTS = [
         None,
         counted("missed_acks", "refused"),
         LOST,
-        "not acknowledged|no STATUS|received nothing",
+        "not acknowledged|no word|did not hear",
     ),
     Fault(
         "bytes inserted towards the board",
@@ -232,7 +232,7 @@ FAULTS = [
         None,
         counted("missed_acks", "refused"),
         LOST,
-        "not acknowledged|no STATUS|received nothing",
+        "not acknowledged|no word|did not hear",
     ),
     Fault(
         "bits flipped towards the host",
@@ -242,7 +242,7 @@ FAULTS = [
         None,
         counted("bad_frames", "missed_acks"),
         LOST,
-        "not acknowledged|no STATUS|received nothing",
+        "not acknowledged|no word|did not hear",
     ),
     Fault("garbage before a set-point", 5, garbage_at_a_tick, sign=acknowledged_late),
     Fault("runtime stopped for 100 ms", 26, paused, sign=late),
@@ -291,7 +291,7 @@ FAULTS = [
         sent(signal.SIGCONT),
         2.5,
         codes=(74, 79),
-        says="received nothing|missed|tracker|lost|vented by itself",
+        says="did not hear|missed|tracker|lost|vented by itself",
         vents_ms=SILENT_HOST_MS,
     ),
 ]
