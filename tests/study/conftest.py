@@ -12,8 +12,8 @@ COMMAND = Path(sys.executable).with_name("modsoft-evaluate")
 
 
 @pytest.fixture(scope="session")
-def evaluate():
-    """evaluate(*arguments) starts modsoft-evaluate in a process group of its own."""
+def start_evaluate():
+    """start_evaluate(*arguments) starts modsoft-evaluate in a process group of its own."""
 
     def start(*arguments):
         return subprocess.Popen(
@@ -29,11 +29,11 @@ def evaluate():
 
 
 @pytest.fixture(scope="session")
-def ended(evaluate):
-    """ended(*arguments) runs modsoft-evaluate and returns exit code, standard output and error."""
+def run_evaluate(start_evaluate):
+    """run_evaluate(*arguments) runs modsoft-evaluate and returns exit code, standard output and error."""
 
     def run(*arguments):
-        process = evaluate(*arguments)
+        process = start_evaluate(*arguments)
         output, error = process.communicate()
         return process.returncode, output, error
 
@@ -41,10 +41,10 @@ def ended(evaluate):
 
 
 @pytest.fixture(scope="session")
-def shared_study(tmp_path_factory, ended):
+def shared_study(tmp_path_factory, run_evaluate):
     """The folder of a miniature study. Tests do not change it."""
     folder = tmp_path_factory.mktemp("shared") / "study"
-    code, _, error = ended("study", "--quick", "--jobs", "1", "--out", folder)
+    code, _, error = run_evaluate("study", "--quick", "--jobs", "1", "--out", folder)
     assert code == 0, error
     return folder
 

@@ -44,20 +44,20 @@ def test_study_writes_the_report_every_run_and_every_figure(shared_study):
         assert title in folder.report.read_text()
 
 
-def test_second_run_makes_nothing_again(study, ended):
+def test_second_run_makes_nothing_again(study, run_evaluate):
     before, first = modification_times(study), (study / "results.json").read_bytes()
-    code, _, error = ended("study", "--quick", "--jobs", "2", "--out", study)
+    code, _, error = run_evaluate("study", "--quick", "--jobs", "2", "--out", study)
     assert code == 0, error
     assert modification_times(study) == before
     assert (study / "results.json").read_bytes() == first
 
 
-def test_study_killed_in_training_resumes_to_the_same_models(study, evaluate, ended):
+def test_study_killed_in_training_resumes_to_the_same_models(study, start_evaluate, run_evaluate):
     folder = Folder(study)
     expected = {model: checkpoint.load(folder.checkpoint(model))["weights"] for model in PLAN.models}
     shutil.rmtree(study / "models")
     training = ("study", "--quick", "--jobs", "2", "--only", "train", "--out", study)
-    process = evaluate(*training)
+    process = start_evaluate(*training)
     while not (study / "models").is_dir() or not list((study / "models").glob("*.pt")):
         assert process.poll() is None, process.communicate()[1]
         time.sleep(0.02)  # of another process
@@ -65,17 +65,17 @@ def test_study_killed_in_training_resumes_to_the_same_models(study, evaluate, en
     process.communicate()
     assert not all(folder.checkpoint(model).is_file() for model in PLAN.models)
 
-    code, _, error = ended(*training)
+    code, _, error = run_evaluate(*training)
     assert code == 0, error
     for model, weights in expected.items():
         resumed = checkpoint.load(folder.checkpoint(model))["weights"]
         assert all(torch.equal(resumed[name], weights[name]) for name in weights), model.name
 
 
-def test_model_with_other_settings_is_refused_in_one_line(study, ended):
+def test_model_with_other_settings_is_refused_in_one_line(study, run_evaluate):
     folder = Folder(study)
     shutil.copy(folder.checkpoint(LSTM), folder.checkpoint(MAIN))
-    code, _, error = ended("study", "--quick", "--jobs", "1", "--only", "train", "--out", study)
+    code, _, error = run_evaluate("study", "--quick", "--jobs", "1", "--only", "train", "--out", study)
     assert code == ModelError.exit_code
     assert f"{MAIN.name}.pt" in error.splitlines()[-1]
     assert "Traceback" not in error
@@ -146,10 +146,10 @@ def test_every_number_of_the_paper_is_in_the_results(shared_study):
     assert (tip.mean, tip.skipped_steps) == (1.80, 5)
 
 
-def test_report_is_made_from_the_results_alone(shared_study, tmp_path, ended):
+def test_report_is_made_from_the_results_alone(shared_study, tmp_path, run_evaluate):
     shutil.copy(shared_study / "results.json", tmp_path)
     (tmp_path / "notes.md").write_text("## Conclusions\n\nTwice as good.\n")
-    code, _, error = ended("report", tmp_path)
+    code, _, error = run_evaluate("report", tmp_path)
     assert code == 0, error
     without = (shared_study / "report.md").read_text()
     noted = (tmp_path / "report.md").read_text()
@@ -157,30 +157,30 @@ def test_report_is_made_from_the_results_alone(shared_study, tmp_path, ended):
     assert noted != without
 
 
-def test_report_results_and_figures_are_published(shared_study, tmp_path, ended):
-    code, _, error = ended("report", shared_study, "--to", tmp_path / "docs")
+def test_report_results_and_figures_are_published(shared_study, tmp_path, run_evaluate):
+    code, _, error = run_evaluate("report", shared_study, "--to", tmp_path / "docs")
     assert code == 0, error
     copied = {str(path.relative_to(tmp_path / "docs")) for path in (tmp_path / "docs").rglob("*") if path.is_file()}
     assert copied == {"report.md", "results.json", *(f"figures/{name}.png" for name in figures.CAPTIONS)}
     assert (tmp_path / "docs/report.md").read_bytes() == (shared_study / "report.md").read_bytes()
 
 
-def test_missing_results_are_refused_with_the_command_that_makes_them(tmp_path, ended):
-    code, _, error = ended("report", tmp_path)
+def test_missing_results_are_refused_with_the_command_that_makes_them(tmp_path, run_evaluate):
+    code, _, error = run_evaluate("report", tmp_path)
     assert (code, len(error.splitlines())) == (ModelError.exit_code, 1)
     assert "modsoft-evaluate study" in error
 
 
-def test_miniature_and_full_study_are_not_mixed_in_one_folder(study, ended):
-    code, _, error = ended("study", "--jobs", "1", "--only", "collect", "--out", study)
+def test_miniature_and_full_study_are_not_mixed_in_one_folder(study, run_evaluate):
+    code, _, error = run_evaluate("study", "--jobs", "1", "--only", "collect", "--out", study)
     assert code == ModelError.exit_code
     assert "expected" in error.splitlines()[-1]
     assert "Traceback" not in error
 
 
-def test_folder_that_cannot_be_made_is_refused_in_one_line(tmp_path, ended):
+def test_folder_that_cannot_be_made_is_refused_in_one_line(tmp_path, run_evaluate):
     (tmp_path / "file").write_text("")
-    code, _, error = ended("study", "--quick", "--out", tmp_path / "file/study")
+    code, _, error = run_evaluate("study", "--quick", "--out", tmp_path / "file/study")
     assert (code, len(error.splitlines())) == (OutputError.exit_code, 1)
 
 

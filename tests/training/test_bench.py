@@ -91,3 +91,9 @@ def test_step_time_is_split_into_gradient_and_optimizer(bench):
     assert [(row["batch"], row["modules"]) for row in rows] == [(128, 3), (256, 4)]
     for row in rows:
         assert row["share"] == pytest.approx(row["optimizer_ms"] / (row["gradient_ms"] + row["optimizer_ms"]))
+
+
+@pytest.mark.parametrize("name", ["collect", "latency", "loop", "models", "simulation", "training"])
+def test_every_benchmark_has_the_common_options(name):
+    options = {option for parameter in benchmarks.load(name).main.params for option in parameter.opts}
+    assert {"--json", "--quick"} <= options

@@ -122,9 +122,8 @@ def load(path: Path) -> Results:
     try:
         return msgspec.json.decode(read_text(path), type=Results)
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise ModelError(
-            f"{path}: not the results of this version ({error}); run modsoft-evaluate study --only measure"
-        ) from error
+        again = f"modsoft-evaluate study --out {path.parent} writes them again"
+        raise ModelError(f"{path}: not the results of this version ({error}); {again}") from error
 
 
 def dumped(results: Results) -> str:
