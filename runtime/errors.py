@@ -1,7 +1,7 @@
 """The errors that end a command, each with its exit code.
 
-A message is one line for a person: what was found, what was expected, what to do next.
-Commands print it and leave with `exit_code`; anything else is a bug and leaves with `INTERNAL_EXIT_CODE`.
+A message is one line: what was found, what was expected, what to do next. Commands print it and exit with
+`exit_code`. Any other exception is a bug and ends the command with `INTERNAL_EXIT_CODE`.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ INTERNAL_EXIT_CODE = 70
 
 
 class ModsoftError(Exception):
-    """Base of every error this project raises on purpose."""
+    """Base class of all errors that this project raises."""
 
     exit_code = INTERNAL_EXIT_CODE
 
 
 class UsageError(ModsoftError):
-    """The command was called wrongly."""
+    """The arguments of a command are wrong."""
 
     exit_code = 2
 
@@ -34,7 +34,7 @@ class ModelError(ModsoftError):
 
 
 class DeviceAbsent(ModsoftError):
-    """A device (board, tracker) is not there or does not answer."""
+    """A device (board, tracker) is missing or does not reply."""
 
     exit_code = 69
 
@@ -46,31 +46,31 @@ class OutputError(ModsoftError):
 
 
 class LostInRun(ModsoftError):
-    """A device that worked at the start of the run was lost in the middle of it."""
+    """A device was lost during the run."""
 
     exit_code = 74
 
 
 class PortBusy(ModsoftError):
-    """The serial port is held by another program, or may not be opened."""
+    """The serial port is in use by another program, or not permitted."""
 
     exit_code = 75
 
 
 class InUse(ModsoftError):
-    """Another process works on the same files."""
+    """Another process uses the same files."""
 
     exit_code = 75
 
 
 class ProtocolMismatch(ModsoftError):
-    """The board speaks another protocol, or is configured for other hardware than the robot file says."""
+    """The board has another protocol, or another configuration than the robot file."""
 
     exit_code = 76
 
 
 class TargetNotReached(ModsoftError):
-    """A training ended above the validation error that was asked for."""
+    """A training ended above the requested validation error."""
 
     exit_code = 77
 

@@ -1,5 +1,5 @@
-"""Files that a command reads and writes: an output has its name only when it is whole, goes where a link leads, and
-never replaces an input or what is no regular file."""
+"""Reading and writing of files. An output gets its name only when it is complete, is written through symbolic links,
+and never replaces an input or anything but a regular file."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from tokenize import TokenError
 
 from modsoft.runtime.errors import ModelError, ModsoftError, OutputError, UsageError
 
-# What numpy.load raises for a file that is damaged, none of its own, or claims to be huge.
+# Raised by numpy.load for a file that is damaged, of another format, or claims a huge size.
 NOT_AN_ARRAY = (ValueError, EOFError, MemoryError, TokenError)
 
-
-# Byte order marks. That of UTF-32 comes first: it begins with the one of UTF-16.
-MARKS = {
+# UTF-32 first: its mark begins with that of UTF-16.
+BYTE_ORDER_MARKS = {
     codecs.BOM_UTF32_LE: "utf-32-le",
     codecs.BOM_UTF32_BE: "utf-32-be",
     codecs.BOM_UTF8: "utf-8",
@@ -28,21 +27,23 @@ MARKS = {
 
 
 def decoded(data: bytes) -> str:
-    """Text in UTF-8, or in whatever Unicode its byte order mark names, as editors and shells of Windows write it. Ends
-    of lines become \\n. ValueError in words for anything else."""
-    mark, encoding = next(((mark, name) for mark, name in MARKS.items() if data.startswith(mark)), (b"", "utf-8"))
+    """Decodes UTF-8, or the encoding of the byte order mark, as written by editors and shells on Windows. Line ends
+    become \\n. ValueError for anything else."""
+    mark, encoding = next(
+        ((mark, name) for mark, name in BYTE_ORDER_MARKS.items() if data.startswith(mark)), (b"", "utf-8")
+    )
     try:
         text = data[len(mark) :].decode(encoding)
     except UnicodeDecodeError as error:
         where = f"byte {data[len(mark) + error.start]:#04x} at offset {len(mark) + error.start}"
         raise ValueError(f"not {encoding.upper()} text ({where}); save it as UTF-8") from error
     if "\0" in text:
-        raise ValueError("holds zero bytes: not text, or UTF-16 without a byte order mark; save it as UTF-8")
+        raise ValueError("contains zero bytes: not text, or UTF-16 without a byte order mark; save it as UTF-8")
     return text.replace("\r\n", "\n")
 
 
 def read_text(path: Path, wrong: type[ModsoftError] = ModelError) -> str:
-    """The text of a file that people write; see `decoded`. `wrong` in one line where there is none."""
+    """Reads a text file (see `decoded`). Raises `wrong` if it cannot be read or is not text."""
     try:
         return decoded(path.read_bytes())
     except OSError as error:
@@ -52,7 +53,7 @@ def read_text(path: Path, wrong: type[ModsoftError] = ModelError) -> str:
 
 
 def check_is_file(path: Path, what: str, advice: str) -> None:
-    """`ModelError` where no regular file is at `path`. what: which file is meant; advice: where one comes from."""
+    """`ModelError` unless `path` is a regular file. what: kind of file; advice: how to make one."""
     if path.is_dir():
         raise ModelError(f"{path}: found a folder, expected a {what}; {advice}")
     if not path.is_file():
@@ -60,17 +61,17 @@ def check_is_file(path: Path, what: str, advice: str) -> None:
 
 
 def target_of(path: Path) -> Path:
-    """Where a file written as `path` goes: `path` itself, or what its links lead to, whether that exists or not."""
+    """The file that is written for `path`: `path`, or the target of its links, which need not exist."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def check_writable(path: Path) -> None:
-    """Reports before any work is done that `path` cannot be written: `UsageError` where its folder is missing or it is
-    no regular file (a folder, a device), `OutputError` where the folder is read-only. Of a link its target counts."""
+    """Checks before any work that `path`, or the target of its links, can be written. `UsageError` if its folder is
+    missing or it is not a regular file (a folder, a device), `OutputError` if the folder is read-only."""
     target = target_of(path)
     name = str(path) if target == path else f"{path}, a link to {target}"
     if target.is_symlink():
-        raise UsageError(f"{path}: a link that leads to itself; expected the name of a file to write")
+        raise UsageError(f"{path}: a link to itself; expected the name of a file to write")
     if path.exists() and not path.is_file():
         what = "a folder" if path.is_dir() else "a device or pipe"
         raise UsageError(f"{name}: {what}; expected the name of a file to write")
@@ -82,16 +83,16 @@ def check_writable(path: Path) -> None:
 
 
 def check_not_input(out: Path, *inputs: Path) -> None:
-    """`UsageError` where writing `out` would replace one of the files that are read, under this or another name."""
+    """`UsageError` if `out` is one of the input files, under this or another name."""
     for path in inputs:
-        with contextlib.suppress(OSError):  # a file that does not exist is reported where it is read
+        with contextlib.suppress(OSError):  # a missing file is reported where it is read
             if os.path.samefile(out, path):
                 name = f"the input {path}" if out == path else f"the same file as the input {path}"
                 raise UsageError(f"{out}: {name}, which would be replaced; give the output another name")
 
 
 def make_folder(path: Path) -> None:
-    """Makes `path` and the folders above it where they are missing, through links. `OutputError` where it cannot."""
+    """Makes `path` and its missing parents, through links. `OutputError` if that fails."""
     try:
         Path(os.path.realpath(path)).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -100,13 +101,13 @@ def make_folder(path: Path) -> None:
 
 @contextlib.contextmanager
 def written(path: Path, through_links: bool = True) -> Iterator[Path]:
-    """A name to write to, which becomes `path` at the end; a kill or an error leaves what was there.
+    """Yields a temporary name, which is renamed to `path` at the end; a kill or an error leaves the old file.
 
-    Where `path` is a link, the link stays and its target is written, with the temporary file beside the target: a link
-    usually leads to another disk. Without `through_links`, for folders that others can write to, the link is replaced.
+    If `path` is a link, its target is written, with the temporary file beside the target, which may be on another disk.
+    With through_links False, for folders that others can write to, the link is replaced.
 
-    Raises what `check_writable` does, and `OutputError` for what the system reports meanwhile (a full disk). The
-    temporary name holds machine and process: several may write the same file to a shared folder.
+    Raises what `check_writable` does, and `OutputError` for errors of the system (a full disk). The temporary name
+    contains machine and process, so that several can write the same file in a shared folder.
     """
     if through_links or not path.is_symlink():
         check_writable(path)
@@ -122,5 +123,5 @@ def written(path: Path, through_links: bool = True) -> Iterator[Path]:
             f"{path}: cannot be written ({error.strerror or error}); {advice} or choose another --out"
         ) from error
     finally:
-        with contextlib.suppress(OSError):  # where that fails too, the first error is the one to report
+        with contextlib.suppress(OSError):  # report the first error
             temporary.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""One process at a time works on an output that can be resumed."""
+"""Lock files: one process at a time writes a resumable output."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from modsoft.runtime.errors import InUse, OutputError
 
 
 def system_module(name: str) -> Any:
-    """A module of the standard library that only some systems have, or None."""
+    """A module of the standard library, or None on systems without it."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -26,11 +26,11 @@ fcntl, msvcrt = system_module("fcntl"), system_module("msvcrt")  # POSIX, Window
 
 @contextlib.contextmanager
 def locked(lock: Path, output: Path, command: str) -> Iterator[None]:
-    """Holds the empty file `lock` for this process alone, and deletes it at the end.
+    """Locks the empty file `lock` for this process, and deletes it at the end.
 
-    `InUse` while another process holds it; `output` and `command` are named in the message. The system releases the
-    lock when its process ends, however it ends: a file that was left behind blocks nothing. `OutputError` where the
-    file cannot be made. A link is not followed, since it might name any file of the user's.
+    `InUse`, with `output` and `command` in the message, while another process has the lock. The system releases the
+    lock when its process ends in any way, so that a remaining file blocks nothing. `OutputError` if the file cannot be
+    made. Links are not followed, because they may point to any file of the user.
     """
     while True:
         descriptor = _open(lock)
@@ -43,10 +43,10 @@ def locked(lock: Path, output: Path, command: str) -> Iterator[None]:
                 finally:
                     _delete(lock, descriptor)
                 return
-            # else another process has deleted this file since it was opened, and a third may hold a new one
+            # else another process deleted this file since it was opened, and a third one may have locked a new file
         finally:
             os.close(descriptor)
-            if os.name == "nt":  # an open file cannot be deleted there; one that another process opened stays
+            if os.name == "nt":  # Windows does not delete an open file; one that another process has open remains
                 _delete(lock)
 
 
@@ -57,7 +57,7 @@ def _open(lock: Path) -> int:
             raise OSError(errno.ELOOP, "a link, expected a file")
         try:
             return os.open(lock, os.O_RDWR | os.O_CREAT | flags, 0o666)
-        except PermissionError:  # left behind by another user
+        except PermissionError:  # a file of another user
             return os.open(lock, os.O_RDONLY | flags)
     except OSError as error:
         why = "a link, expected a file" if lock.is_symlink() else error.strerror
@@ -65,7 +65,7 @@ def _open(lock: Path) -> int:
 
 
 def _take(descriptor: int) -> bool:
-    """Locks an open file; False where another process has it. Where the file system has no locks, all have it."""
+    """Locks an open file; False if another process has locked it. True on file systems without locks."""
     try:
         if fcntl is not None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -79,7 +79,7 @@ def _take(descriptor: int) -> bool:
 
 
 def _is_at(lock: Path, descriptor: int) -> bool:
-    """Whether the open file is the one at `lock`."""
+    """Whether the open file is still the one at `lock`."""
     try:
         return os.path.samestat(os.fstat(descriptor), os.stat(lock))
     except FileNotFoundError:
@@ -87,7 +87,7 @@ def _is_at(lock: Path, descriptor: int) -> bool:
 
 
 def _delete(lock: Path, descriptor: int | None = None) -> None:
-    """Deletes the lock's file. One with content was made by somebody else, and stays."""
+    """Deletes the lock file, unless it has content: then it is not a lock file."""
     with contextlib.suppress(OSError):
         if (os.stat(lock) if descriptor is None else os.fstat(descriptor)).st_size == 0:
             lock.unlink()

@@ -1,5 +1,5 @@
-"""Settings of a whole process, made before other libraries are imported: writable folders for their caches, and no
-imports from the current folder. Child processes inherit them."""
+"""Settings of the process before other libraries are imported: writable cache folders, no imports from the current
+folder. Child processes inherit them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from modsoft.runtime.errors import UsageError
 
-# Folders that libraries (numba, matplotlib, torch, onnxruntime, dask) write to, and their defaults below the home.
+# Folders of libraries (numba, matplotlib, torch, onnxruntime, dask), and their defaults below the home.
 BELOW_HOME = {
     "XDG_CACHE_HOME": ".cache",
     "XDG_CONFIG_HOME": ".config",
@@ -24,15 +24,15 @@ PARTS = ("runtime", "training", "export", "hil", "study")
 
 
 def prepare() -> None:
-    """Call it before any import of those libraries; again does no harm."""
+    """Call before any import of those libraries; may be called again."""
     os.environ["PYTHONSAFEPATH"] = "1"  # of child processes: a script in the current folder may have a module's name
     if os.name == "posix":
         _replace_unwritable_folders()
 
 
 def check_import() -> None:
-    """`UsageError` where a folder `modsoft` on Python's path, another clone for instance, shadows the installation:
-    modsoft is a namespace package, to which every folder of that name adds its modules."""
+    """`UsageError` if a folder `modsoft` on Python's path, such as another clone, shadows the installation. modsoft is
+    a namespace package: every folder of that name adds its modules."""
     import modsoft
 
     for portion in map(Path, modsoft.__path__):
@@ -45,7 +45,7 @@ def check_import() -> None:
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether files can be made in `folder`, or in the nearest folder above it that exists."""
+    """Whether files can be made in `folder`, or in its nearest existing parent."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     probe = folder / f".modsoft-probe-{os.getpid()}"
@@ -59,16 +59,16 @@ def is_writable(folder: Path) -> bool:
 
 @functools.cache
 def temporary_folder() -> Path:
-    """Of this process, deleted at its end."""
+    """Temporary folder of this process, deleted at its end."""
     folder = tempfile.mkdtemp(prefix="modsoft-home-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return Path(folder)
 
 
 def _replace_unwritable_folders() -> None:
-    """A user without a home (a container's --user), or with one that is read-only, gets temporary folders."""
+    """Sets temporary folders for a user with no home (a container with --user) or a read-only one."""
     if os.environ.get("HOME") == "":
-        del os.environ["HOME"]  # else it stands for /
+        del os.environ["HOME"]  # else it means /
     home = os.path.expanduser("~")
     if not (os.path.isabs(home) and os.path.isdir(home) and is_writable(Path(home))):
         home = os.environ["HOME"] = str(temporary_folder() / "home")

@@ -1,7 +1,7 @@
-"""The robot file: one TOML, read strictly into frozen types that every other part conforms to.
+"""The robot file (TOML), parsed strictly into frozen types.
 
-An unknown key, a missing key, a wrong type or a value out of range ends in one line that names the place in the
-file, what was found and what was expected (`RobotFileError`, exit code 64). Units stand in the names.
+Unknown or missing keys, wrong types and values out of range raise `RobotFileError` (exit code 64). The message is one
+line: the place in the file, what was found and what was expected. Names contain units.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from modsoft.runtime.validation_messages import explain
 
 
 class Kind(NamedTuple):
-    """What is fixed by the way a module is driven; `state` names the parts of the configuration in feature order."""
+    """Properties of a kind of robot. state, action: names of the components, in feature order."""
 
     state: tuple[str, ...]
     action: tuple[str, ...]
-    channels: int  # cables or chambers a module
+    channels: int  # cables or chambers of each module
 
 
 KINDS: dict[str, Kind] = {
@@ -39,7 +39,7 @@ Bar = Annotated[float, Meta(ge=0.0, le=10.0)]
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the robot file: every key is known, nothing changes after reading."""
+    """A table of the robot file. Frozen; unknown keys are errors."""
 
 
 class Identity(Section, frozen=True):
@@ -54,14 +54,14 @@ class Valve(Section, frozen=True):
     """`[valve]`: the pressure regulators. Activation 0 is `p_min_bar`, activation 1 is `p_max_bar` (section 3.1)."""
 
     model: str
-    full_scale_bar: Annotated[float, Meta(gt=0.0, le=10.0)]  # off the label: 10 V mean another pressure on each type
-    signal: Literal["0-10 V"]  # what the board and its amplifiers give; a current loop would need other ones
+    full_scale_bar: Annotated[float, Meta(gt=0.0, le=10.0)]  # from the label of the valve: pressure at 10 V
+    signal: Literal["0-10 V"]  # output of the board and its amplifiers
     p_min_bar: Bar = 0.08
     p_max_bar: Bar = 0.35
 
 
 class Chamber(Section, frozen=True):
-    """`[[chambers]]`: which valve channel inflates which chamber, and what corrects that chamber's pressure.
+    """`[[chambers]]`: valve channel of a chamber, and the correction of its pressure.
 
     side `+` inflates for a_0 > 0, `-` for a_0 < 0 (eq. 3); pressure sent = gain * pressure + offset_bar.
     """
@@ -74,7 +74,7 @@ class Chamber(Section, frozen=True):
 
 
 class Limits(Section, frozen=True):
-    """`[limits]`: what the loop never exceeds, which frames are invalid, and how many of them in a row end a run.
+    """`[limits]`: limits of the control loop, which frames are invalid, and how many of them in a row end a run.
 
     `largest_actuation_step` also bounds the plausible motion between two frames. `largest_rms_mm` is the largest
     quality value of a tool (NDI: RMS error, mm). A tool is invalid with any bit of `refused_port_status` set (NDI: 0x40
@@ -91,7 +91,7 @@ class Limits(Section, frozen=True):
 
 class Tracker(Section, frozen=True):
     """`[tracker]`: source and its port (replay: a run's folder); `tools` are the tool definition files, base first,
-    then module 1 to N. Paths start from the robot file's folder."""
+    then module 1 to N. Paths are relative to the folder of the robot file."""
 
     source: Literal["ndi", "replay"] = "ndi"
     type: Literal["polaris", "vega", "aurora"] = "polaris"
@@ -100,15 +100,15 @@ class Tracker(Section, frozen=True):
 
 
 class Serial(Section, frozen=True):
-    """`[serial]`: the board's port (empty: told on the command line)."""
+    """`[serial]`: the board's port (empty: set on the command line)."""
 
     port: str = ""
     baud: Literal[115200, 250000, 500000, 1000000] = 250000
 
 
 class Loop(Section, frozen=True):
-    """`[loop]`: control rate, and the task that runs when none is given: its name, or a file's path that starts from
-    the robot file's folder."""
+    """`[loop]`: control rate, and the default task: a name, or the path of a file, relative to the folder of the robot
+    file."""
 
     hz: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.5
     task: str = ""
@@ -120,7 +120,7 @@ class Loop(Section, frozen=True):
 
 
 class Robot(Section, frozen=True):
-    """A whole robot file. `kind` gives the state and action sizes; a cable robot is simulated, so it has no valves."""
+    """A robot file. `kind` determines state and action sizes; a cable robot is simulated and has no valves."""
 
     robot: Identity
     loop: Loop
@@ -158,24 +158,24 @@ class Robot(Section, frozen=True):
 
 
 def names() -> list[str]:
-    """The robots that ship with the runtime."""
+    """Names of the shipped robots."""
     folder = resources.files("modsoft.runtime") / "robots"
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
 def text_of(name: str) -> str:
-    """The robot file of a shipped robot, comments and all, to start one's own from. Cable robots are simulated, so that
-    there is one for any number N of modules: cable-N."""
+    """Text of the robot file of a shipped robot, with its comments. cable-N exists for every number N of modules.
+    `RobotFileError` for another name."""
     if name in names():
         return (resources.files("modsoft.runtime") / "robots" / f"{name}.toml").read_text(encoding="utf-8")
     if cable := re.fullmatch(r"cable-([1-9][0-9]?)", name):
         text = text_of("cable-4").replace('"cable-4"', f'"{name}"').replace("modules = 4", f"modules = {cable[1]}")
         return text.replace("4 modules", f"{cable[1]} modules")
-    raise RobotFileError(f"no robot is called {name!r}; the ones that ship are {', '.join(names())}, and cable-N")
+    raise RobotFileError(f"no shipped robot {name!r}; expected one of {', '.join(names())}, or cable-N")
 
 
 def load(file_or_name: str | Path) -> Robot:
-    """Reads a robot file, or a shipped robot by its name. A file wins where both exist."""
+    """Reads a robot file, or a shipped robot by its name; a file takes precedence."""
     path = Path(file_or_name)
     if path.is_dir():
         raise RobotFileError(f"{path} is a folder, expected a robot file; give the file, such as {path / 'robot.toml'}")
@@ -185,13 +185,13 @@ def load(file_or_name: str | Path) -> Robot:
 
 
 def folder_of(file_or_name: str | Path) -> Path:
-    """The folder that the paths in a robot file start from: its own, or for a shipped robot the current one."""
+    """Base of the relative paths in a robot file: its folder, or the current one for a shipped robot."""
     path = Path(file_or_name)
     return path.parent if path.is_file() else Path()
 
 
 def shipped(name: str) -> Robot:
-    """A shipped robot by its name, whatever files there are."""
+    """A shipped robot by its name, regardless of files."""
     try:
         text = text_of(name)
     except RobotFileError:
@@ -204,7 +204,7 @@ def shipped(name: str) -> Robot:
 
 
 def parse(text: str, where: str = "robot file") -> Robot:
-    """Robot file text to `Robot`; `where` is named in the errors."""
+    """Parses the text of a robot file; where: name of the file, for errors."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -213,7 +213,7 @@ def parse(text: str, where: str = "robot file") -> Robot:
 
 
 def from_dict(table: dict[str, Any], where: str = "robot") -> Robot:
-    """Plain values (TOML, a checkpoint, ONNX metadata) to `Robot`, checked as strictly as the file."""
+    """Converts plain values (of a checkpoint, ONNX metadata, TOML) to `Robot`, with the same checks as the file."""
     try:
         robot = msgspec.convert(table, Robot)
     except msgspec.ValidationError as error:
@@ -223,7 +223,7 @@ def from_dict(table: dict[str, Any], where: str = "robot") -> Robot:
 
 
 def _check(robot: Robot, where: str) -> None:
-    """What types cannot say: keys that belong together."""
+    """Checks the relations between keys."""
 
     def refuse(found: str, expected: str) -> None:
         raise RobotFileError(f"{where}: {found}; expected {expected}")
@@ -246,12 +246,15 @@ def _check(robot: Robot, where: str) -> None:
             f"full_scale_bar {valve.full_scale_bar}",
             "p_min_bar < p_max_bar <= full_scale_bar",
         )
-    wanted: Counter[tuple[int, str]] = Counter((module, side) for module in range(1, count + 1) for side in "+-")
-    found: Counter[tuple[int, str]] = Counter((chamber.module, chamber.side) for chamber in robot.chambers)
-    if found != wanted:
+    required: Counter[tuple[int, str]] = Counter((module, side) for module in range(1, count + 1) for side in "+-")
+    chambers: Counter[tuple[int, str]] = Counter((chamber.module, chamber.side) for chamber in robot.chambers)
+    if chambers != required:
         wrong = [
-            f"{word}: {', '.join(f'module {module} side {side}' for module, side in sorted(places))}"
-            for word, places in (("missing", wanted - found), ("too many", found - wanted))
+            f"{label}: {', '.join(f'module {module} side {side}' for module, side in sorted(places))}"
+            for label, places in (
+                ("missing", required - chambers),
+                ("too many", chambers - required),
+            )
             if places
         ]
         refuse(
@@ -262,4 +265,4 @@ def _check(robot: Robot, where: str) -> None:
     channels = Counter(chamber.channel for chamber in robot.chambers)
     twice = sorted(channel for channel, uses in channels.items() if uses > 1)
     if twice:
-        refuse(f"valve channel {twice[0]} is given to two chambers", "a channel of its own for each")
+        refuse(f"valve channel {twice[0]} is used by two chambers", "a different channel for each")

@@ -139,7 +139,7 @@ def plot(data_files: tuple[Path, ...], out: Path) -> None:
         click.echo(coverage.line(each))
 
 
-main = entry(cli, goes_on=True)
+main = entry(cli, resumable=True)
 
 if __name__ == "__main__":
     main()

@@ -156,7 +156,7 @@ def _print_result(provenance: dict[str, Any], out: Path, existed: bool) -> None:
     click.echo(f"{out}: {'exists already, ' if existed else ''}{iterations} in {provenance['seconds']:.0f} s")
 
 
-main = entry(cli, goes_on=True)
+main = entry(cli, resumable=True)
 
 if __name__ == "__main__":
     main()

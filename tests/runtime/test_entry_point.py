@@ -1,4 +1,4 @@
-"""How a console script ends, whatever happens to it and to its streams."""
+"""Exit codes and messages of console scripts, under signals, errors and closed streams."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ def cli(what):
     elif what == "missing":
         raise ModuleNotFoundError("No module named 'torch'", name="torch.nn")
     elif what == "bug":
-        raise ModuleNotFoundError("No module named 'ours'", name="ours")
+        raise ModuleNotFoundError("No module named 'own'", name="own")
     elif what == "read":
         click.echo(repr(sys.stdin.read()))
     else:
@@ -32,31 +32,31 @@ def cli(what):
         finally:
             click.echo("cleared up")
 
-entry(cli, goes_on=True)()
+entry(cli, resumable=True)()
 """
 
 
 def run(what: str, **streams) -> subprocess.CompletedProcess:
-    told = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **streams}
-    return subprocess.run([sys.executable, "-c", SCRIPT, what], text=True, timeout=60, check=False, **told)
+    options = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **streams}
+    return subprocess.run([sys.executable, "-c", SCRIPT, what], text=True, timeout=60, check=False, **options)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-def test_a_signal_ends_it_in_order(name, code):
-    # A suite that a script starts in the background ignores Ctrl-C, and so would its children.
+def test_signal_ends_the_command_orderly(name, code):
+    # A test suite in the background of a script ignores Ctrl-C, and so do its children.
     done = run(name, preexec_fn=lambda: signal.signal(getattr(signal, name), signal.SIG_DFL))
     assert (done.returncode, done.stdout) == (code, "cleared up\n")
-    assert done.stderr.strip() == "modsoft-train: interrupted; the same command goes on"
+    assert done.stderr.strip() == "modsoft-train: interrupted; run the same command to resume"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_what_nohup_ignores_stays_ignored():
+def test_ignored_signal_stays_ignored():
     done = run("SIGHUP", preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))
     assert (done.returncode, done.stdout, done.stderr) == (0, "cleared up\n", "")
 
 
-def test_a_missing_package_names_its_extra_and_a_missing_module_of_ours_is_a_bug():
+def test_missing_package_names_its_extra_and_missing_own_module_is_a_bug():
     done = run("missing")
     assert done.returncode == 69
     assert "extra 'train': pip install '.[train]'" in done.stderr
@@ -64,19 +64,19 @@ def test_a_missing_package_names_its_extra_and_a_missing_module_of_ours_is_a_bug
     assert run("bug").returncode == 70
 
 
-def test_nobody_reads_the_output():
+def test_closed_output_ends_without_a_message():
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as closed:
         done = run("lines", stdout=closed)
         assert (done.returncode, done.stderr) == (141, "")
-        done = run("read", stdout=closed)  # so little that it goes out at the very end
+        done = run("read", stdout=closed)  # written only when flushed at exit
         assert (done.returncode, done.stderr) == (141, "")
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
 @pytest.mark.parametrize("what", ["lines", "read"])
-def test_a_full_output_is_one_line(what):
+def test_full_output_is_one_line(what):
     with open("/dev/full", "w") as full:
         done = run(what, stdout=full)
     assert done.returncode == 73
@@ -85,13 +85,13 @@ def test_a_full_output_is_one_line(what):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="closes file descriptors")
-def test_streams_that_were_closed_before():
+def test_streams_closed_before_the_start():
     for number in range(3):
         done = run("read", preexec_fn=lambda number=number: os.close(number))
         assert done.returncode == 0, done.stderr
 
 
-def test_options_and_choices_of_earlier_versions_are_refused_with_the_new_name(capsys, monkeypatch):
+def test_renamed_options_and_choices_are_refused_with_the_new_name(capsys, monkeypatch):
     @click.command("modsoft-train")
     @click.option("--kind", type=Choice(["new"], {"old": "new"}))
     @renamed_option("--before", "--now")

@@ -1,4 +1,4 @@
-"""What is written: whole, or not at all and said in one line."""
+"""Files are written completely or not at all, through links; text is read in every Unicode encoding."""
 
 import codecs
 import os
@@ -11,7 +11,7 @@ from modsoft.runtime.errors import ModelError, OutputError, RobotFileError, Usag
 from modsoft.runtime.files import check_not_input, check_writable, make_folder, read_text, written
 
 
-def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path):
+def test_old_file_remains_until_the_new_one_is_complete(tmp_path):
     path = tmp_path / "out.bin"
     path.write_bytes(b"old")
     with written(path) as temporary:
@@ -21,7 +21,7 @@ def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path):
     assert os.listdir(tmp_path) == ["out.bin"]
 
 
-def test_an_error_leaves_what_was_there_and_is_the_one_told(tmp_path, monkeypatch):
+def test_error_leaves_the_old_file_and_is_reported(tmp_path, monkeypatch):
     path = tmp_path / "out.bin"
     path.write_bytes(b"old")
 
@@ -43,7 +43,7 @@ def test_an_error_leaves_what_was_there_and_is_the_one_told(tmp_path, monkeypatc
 
 
 @pytest.mark.skipif(os.name != "posix", reason="device files of POSIX")
-def test_nothing_but_a_regular_file_is_replaced(tmp_path):
+def test_only_a_regular_file_is_replaced(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for name in ("/dev/null", tmp_path / "pipe", tmp_path):
         with pytest.raises(UsageError, match="expected the name of a file"):
@@ -52,11 +52,11 @@ def test_nothing_but_a_regular_file_is_replaced(tmp_path):
         check_writable(tmp_path / "absent" / "out.bin")
 
 
-def test_a_folder_that_lets_nobody_write_is_told_before(tmp_path, monkeypatch):
+def test_read_only_folder_is_reported_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
-    with pytest.raises(OutputError, match="read-only") as told:
+    with pytest.raises(OutputError, match="read-only") as caught:
         check_writable(tmp_path / "out.bin")
-    assert told.value.exit_code == 73
+    assert caught.value.exit_code == 73
 
 
 # ---- Links ----------------------------------------------------------------------------------------------------------
@@ -71,7 +71,7 @@ def disk(tmp_path):
 
 @pytest.mark.parametrize("exists", [True, False])
 @pytest.mark.parametrize("steps", [1, 2])
-def test_a_link_stays_and_its_target_is_written_beside_the_target(tmp_path, disk, exists, steps):
+def test_target_of_a_link_is_written(tmp_path, disk, exists, steps):
     link, target = tmp_path / "home" / "out.bin", disk / "data.bin"
     if steps == 2:
         (tmp_path / "home" / "middle").symlink_to(target)
@@ -80,7 +80,7 @@ def test_a_link_stays_and_its_target_is_written_beside_the_target(tmp_path, disk
         target.write_bytes(b"old")
     check_writable(link)
     with written(link) as temporary:
-        assert temporary.parent == disk, "another disk cannot take a file by renaming"
+        assert temporary.parent == disk, "a file cannot be renamed to another disk"
         temporary.write_bytes(b"new")
     assert link.is_symlink()
     assert not target.is_symlink()
@@ -89,19 +89,19 @@ def test_a_link_stays_and_its_target_is_written_beside_the_target(tmp_path, disk
 
 
 @pytest.mark.skipif(os.name != "posix", reason="device files of POSIX")
-def test_a_link_that_cannot_be_written_through_is_one_line(tmp_path, disk, monkeypatch):
+def test_link_to_an_invalid_target_is_refused(tmp_path, disk, monkeypatch):
     home = tmp_path / "home"
     (home / "loop").symlink_to("loop")
     (home / "gone").symlink_to(disk / "absent" / "out.bin")
     (home / "folder").symlink_to(disk)
     (home / "device").symlink_to(os.devnull)
-    for name, found in (
-        ("loop", "leads to itself"),
+    for name, message in (
+        ("loop", "a link to itself"),
         ("gone", f"no folder {disk / 'absent'} for .*gone, a link to .*make it first"),
         ("folder", "a folder; expected the name of a file"),
         ("device", "a device or pipe; expected"),
     ):
-        with pytest.raises(UsageError, match=found) as error, written(home / name):
+        with pytest.raises(UsageError, match=message) as error, written(home / name):
             pass
         assert "\n" not in str(error.value)
     (home / "out").symlink_to(disk / "out")
@@ -110,7 +110,7 @@ def test_a_link_that_cannot_be_written_through_is_one_line(tmp_path, disk, monke
         check_writable(home / "out")
 
 
-def test_in_a_folder_of_others_a_link_is_replaced(tmp_path, disk):
+def test_link_is_replaced_in_a_shared_folder(tmp_path, disk):
     (disk / "private").write_bytes(b"mine")
     link = tmp_path / "home" / "episode"
     link.symlink_to(disk / "private")
@@ -119,7 +119,7 @@ def test_in_a_folder_of_others_a_link_is_replaced(tmp_path, disk):
     assert (link.read_bytes(), (disk / "private").read_bytes()) == (b"new", b"mine")
 
 
-def test_a_folder_is_made_where_a_link_leads(tmp_path, disk):
+def test_folder_is_made_through_a_link(tmp_path, disk):
     (tmp_path / "home" / "runs").symlink_to(disk / "runs")
     make_folder(tmp_path / "home" / "runs" / "figures")
     assert (disk / "runs" / "figures").is_dir()
@@ -128,10 +128,10 @@ def test_a_folder_is_made_where_a_link_leads(tmp_path, disk):
         make_folder(disk / "file" / "folder")
 
 
-# ---- An output is never an input ------------------------------------------------------------------------------------
+# ---- Outputs are not inputs -----------------------------------------------------------------------------------------
 
 
-def test_an_output_that_is_an_input_is_refused_under_any_name(tmp_path, monkeypatch):
+def test_output_that_is_an_input_is_refused_under_any_name(tmp_path, monkeypatch):
     source = tmp_path / "a.npy"
     source.write_bytes(b"data")
     (tmp_path / "soft").symlink_to(source)
@@ -145,7 +145,7 @@ def test_an_output_that_is_an_input_is_refused_under_any_name(tmp_path, monkeypa
     check_not_input(tmp_path / "absent", source, tmp_path / "absent")
 
 
-# ---- Text as Windows writes it --------------------------------------------------------------------------------------
+# ---- Encodings of text ----------------------------------------------------------------------------------------------
 
 ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"]
 
@@ -156,13 +156,13 @@ def encoded(text: str, encoding: str) -> bytes:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_text_is_read_in_every_encoding_with_a_byte_order_mark(tmp_path, encoding):
+def test_text_with_a_byte_order_mark_is_read(tmp_path, encoding):
     (tmp_path / "t").write_bytes(encoded("a = 'größer'\nb\n", encoding))
     assert read_text(tmp_path / "t") == "a = 'größer'\nb\n"
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_a_robot_file_is_read_in_every_encoding(tmp_path, encoding):
+def test_robot_file_is_read_in_every_encoding(tmp_path, encoding):
     path = tmp_path / "robot.toml"
     path.write_bytes(encoded(robots.text_of("pneumatic-3"), encoding))
     assert robots.load(path) == robots.load("pneumatic-3")
@@ -177,7 +177,7 @@ def test_a_robot_file_is_read_in_every_encoding(tmp_path, encoding):
         (codecs.BOM_UTF16_LE + b"a\0b", r"not UTF-16-LE text"),
     ],
 )
-def test_what_is_not_text_is_one_line(tmp_path, content, found):
+def test_binary_file_is_refused(tmp_path, content, found):
     path = tmp_path / "robot.toml"
     path.write_bytes(content)
     for read, error in ((read_text, ModelError), (robots.load, RobotFileError)):

@@ -1,4 +1,4 @@
-"""One process at a time on an output; a lock that a killed process left blocks nothing."""
+"""One process at a time writes an output; the lock file of a killed process blocks nothing."""
 
 import os
 import subprocess
@@ -26,7 +26,7 @@ def held(lock):
     return locked(lock, Path("out"), "command")
 
 
-def test_another_process_is_refused_until_the_first_is_gone(tmp_path):
+def test_another_process_is_refused_until_the_first_ends(tmp_path):
     lock = tmp_path / "out.lock"
     command = [sys.executable, "-c", HOLD, str(lock)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
@@ -43,36 +43,36 @@ def test_another_process_is_refused_until_the_first_is_gone(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="an open file cannot be deleted elsewhere")
-def test_a_lock_that_was_deleted_while_it_was_opened_is_made_again(tmp_path, monkeypatch):
+def test_lock_deleted_while_opening_is_made_again(tmp_path, monkeypatch):
     lock, deleted, take = tmp_path / "out.lock", [], locks._take
 
-    def too_late(descriptor):
+    def delete_first(descriptor):
         if not deleted:
             deleted.append(lock.unlink())
         return take(descriptor)
 
-    monkeypatch.setattr(locks, "_take", too_late)
+    monkeypatch.setattr(locks, "_take", delete_first)
     with held(lock):
         assert lock.exists()
         with pytest.raises(InUse), held(lock):
             pass
 
 
-def test_an_error_in_the_work_releases_it(tmp_path):
+def test_error_releases_the_lock(tmp_path):
     with pytest.raises(ZeroDivisionError), held(tmp_path / "out.lock"):
         raise ZeroDivisionError
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_of_somebody_else_keeps_its_content(tmp_path):
+def test_file_with_content_is_kept(tmp_path):
     (tmp_path / "out.lock").write_text("mine")
     with held(tmp_path / "out.lock"):
         pass
     assert (tmp_path / "out.lock").read_text() == "mine"
 
 
-def test_a_file_that_another_user_left_blocks_nothing(tmp_path, monkeypatch):
-    """Root may write to any file, so the system's refusal is played."""
+def test_file_of_another_user_blocks_nothing(tmp_path, monkeypatch):
+    """The error is injected, because root may write to any file."""
     (tmp_path / "out.lock").touch()
     opened = os.open
 
@@ -89,7 +89,7 @@ def test_a_file_that_another_user_left_blocks_nothing(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["link", "folder", "no folder"])
-def test_what_cannot_be_a_lock_is_one_line(tmp_path, kind):
+def test_invalid_lock_file_is_one_line(tmp_path, kind):
     lock, private = tmp_path / "out.lock", tmp_path / "private"
     if kind == "link":
         lock.symlink_to(private)
@@ -102,8 +102,8 @@ def test_what_cannot_be_a_lock_is_one_line(tmp_path, kind):
     assert not private.exists()
 
 
-def test_without_fcntl_it_locks_as_windows_does(tmp_path, monkeypatch):
-    """The system's own function is replaced: what is tested is how it is called and what its errors mean."""
+def test_msvcrt_is_used_without_fcntl(tmp_path, monkeypatch):
+    """With a substitute of the system's function: tests its arguments and the handling of its errors."""
     calls = []
 
     def locking(descriptor, mode, size):
@@ -119,7 +119,7 @@ def test_without_fcntl_it_locks_as_windows_does(tmp_path, monkeypatch):
     assert calls == [(0, 2, 1)] * 2
 
 
-def test_a_file_system_without_locks_stops_nobody(tmp_path, monkeypatch):
+def test_file_system_without_locks_is_no_error(tmp_path, monkeypatch):
     def flock(*_):
         raise OSError(37, "No locks available")
 

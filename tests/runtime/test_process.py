@@ -1,4 +1,4 @@
-"""What a process settles before it imports libraries: caches, imports, telemetry."""
+"""Settings of a process before it imports libraries: caches, imports, telemetry."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from modsoft.runtime import process
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = Path(sys.executable).parent
-# A command that starts a Python process of its own, as the commands with workers do.
+# A command that starts a Python process, as commands with workers do.
 COMMAND = """
 import os, subprocess, sys
 import click
@@ -50,7 +50,7 @@ def test_children_import_nothing_from_the_current_folder(tmp_path):
 
 
 def test_workers_import_nothing_from_the_current_folder(tmp_path):
-    """Those of a Python program, too, which is no command."""
+    """Also in a Python program that is not one of the commands."""
     (tmp_path / "signal.py").write_text("raise SystemExit('a script of the user')")
     code = (
         "from modsoft.training.data import workers\n"
@@ -63,7 +63,7 @@ def test_workers_import_nothing_from_the_current_folder(tmp_path):
 
 @pytest.mark.parametrize("how", ["current folder", "PYTHONPATH"])
 def test_another_clone_is_refused(how, tmp_path):
-    """Seen from above, a clone called modsoft adds its modules to the installed ones."""
+    """A folder modsoft on the path adds its modules to the installed ones."""
     for part in ("runtime", "training", "export"):
         (tmp_path / "modsoft" / part).mkdir(parents=True)
         for source in (ROOT / part).rglob("*.py"):
@@ -82,7 +82,7 @@ def test_another_clone_is_refused(how, tmp_path):
     )
 
 
-def test_a_folder_of_the_same_name_without_code_is_no_other_clone(tmp_path):
+def test_folder_of_the_same_name_without_code_is_accepted(tmp_path):
     (tmp_path / "modsoft" / "notes").mkdir(parents=True)
     done = run(COMMAND, tmp_path, PYTHONPATH=str(tmp_path))
     assert done.returncode == 0, done.stderr
@@ -93,7 +93,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="elsewhere the home is not
 
 @pytest.fixture
 def no_home(tmp_path, monkeypatch):
-    """Temporary folders of the process go below tmp_path, and its settings end with the test."""
+    """No home; temporary folders are below tmp_path, and the settings are restored after the test."""
     monkeypatch.setattr(process.tempfile, "mkdtemp", lambda prefix: str(tmp_path / "temporary"))
     process.temporary_folder.cache_clear()
     for name in ("PYTHONSAFEPATH", "HOME", *process.BELOW_HOME, *process.IF_SET):
@@ -105,7 +105,7 @@ def no_home(tmp_path, monkeypatch):
 
 @posix
 @pytest.mark.parametrize("home", ["/proc", "/dev/null", "/nonexistent", "~", "None"])
-def test_without_a_home_there_is_a_temporary_one(home, no_home, monkeypatch):
+def test_missing_home_is_replaced_by_a_temporary_one(home, no_home, monkeypatch):
     monkeypatch.setenv("HOME", home)
     process.prepare()
     assert os.path.expanduser("~") == str(no_home / "home")
@@ -114,14 +114,14 @@ def test_without_a_home_there_is_a_temporary_one(home, no_home, monkeypatch):
 
 
 @posix
-def test_an_empty_home_is_not_the_root(no_home, monkeypatch):
+def test_empty_home_is_not_the_root(no_home, monkeypatch):
     monkeypatch.setenv("HOME", "")
     process.prepare()
     assert os.path.expanduser("~") != "/"
 
 
 @posix
-def test_caches_that_cannot_be_written_are_replaced_one_by_one(tmp_path, no_home, monkeypatch):
+def test_only_read_only_caches_are_replaced(tmp_path, no_home, monkeypatch):
     home = tmp_path / "home"
     home.mkdir()
     (home / ".cache").write_text("not a folder")
@@ -136,7 +136,7 @@ def test_caches_that_cannot_be_written_are_replaced_one_by_one(tmp_path, no_home
     assert sorted(path.name for path in home.iterdir()) == [".cache"]
 
 
-def test_a_home_is_left_as_it_is(tmp_path, no_home, monkeypatch):
+def test_writable_home_is_unchanged(tmp_path, no_home, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     before = dict(os.environ)
     process.prepare()
@@ -145,7 +145,7 @@ def test_a_home_is_left_as_it_is(tmp_path, no_home, monkeypatch):
 
 
 @posix
-def test_the_temporary_home_ends_with_its_process(tmp_path):
+def test_temporary_home_is_deleted_with_its_process(tmp_path):
     done = run(COMMAND, tmp_path, HOME="/nonexistent", TMPDIR=str(tmp_path))
     assert done.stdout.splitlines()[-1].startswith(str(tmp_path / "modsoft-home-")), done.stderr
     assert list(tmp_path.iterdir()) == []
@@ -154,8 +154,8 @@ def test_the_temporary_home_ends_with_its_process(tmp_path):
 # ---- Telemetry
 
 
-def test_a_control_run_writes_nothing_below_the_home(model_file, tmp_path):
-    """onnxruntime would leave the identity of the device there, and events to send."""
+def test_run_writes_nothing_below_the_home(model_file, tmp_path):
+    """onnxruntime's telemetry would write a device identity and events there."""
     home = tmp_path / "home"
     home.mkdir()
     pose = [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 50.0 * tool], [0, 0, 0, 1]] for tool in range(4)]
@@ -164,12 +164,12 @@ def test_a_control_run_writes_nothing_below_the_home(model_file, tmp_path):
         for k in range(100)
     ]
     (tmp_path / "run.jsonl").write_text("".join(json.dumps({"tick": 0, "frame": each}) + "\n" for each in frames))
-    order = ["--robot", "pneumatic-3", "--model", model_file, "--dry-run", "--yes", "--steps", "1"]
-    order += ["--tracker", "replay", "--tracker-port", "run.jsonl"]
+    arguments = ["--robot", "pneumatic-3", "--model", model_file, "--dry-run", "--yes", "--steps", "1"]
+    arguments += ["--tracker", "replay", "--tracker-port", "run.jsonl"]
     environment = {**os.environ, "HOME": str(home), "USERPROFILE": str(home)}
     environment.pop("ORT_DISABLE_TELEMETRY", None)
     done = subprocess.run(
-        [SCRIPTS / "modsoft-runtime", *order],
+        [SCRIPTS / "modsoft-runtime", *arguments],
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -183,7 +183,7 @@ def test_a_control_run_writes_nothing_below_the_home(model_file, tmp_path):
     assert "telemetry" not in done.stderr
 
 
-def test_onnxruntime_is_imported_in_one_place():
+def test_only_ort_imports_onnxruntime():
     importers = [
         path.relative_to(ROOT).as_posix()
         for folder in ("runtime", "training", "export", "tools", "tests")

@@ -1,4 +1,4 @@
-"""The robot file: what is accepted, and that every mistake is named."""
+"""The robot file: shipped robots, parsing, and the message of every error."""
 
 import dataclasses
 
@@ -24,12 +24,12 @@ def test_shipped_robots(name, kind, modules, state, action):
     assert (robot.state_size, robot.action_size) == (state, action)
 
 
-def test_exactly_these_four_ship():
+def test_names_of_shipped_robots():
     assert robots.names() == ["cable-4", "cable-6", "pneumatic-2", "pneumatic-3"]
 
 
 @pytest.mark.parametrize("modules", [2, 3, 5, 8, 12, 64])
-def test_a_cable_robot_of_any_number_of_modules_has_a_name(modules):
+def test_cable_robot_exists_for_any_number_of_modules(modules):
     name = f"cable-{modules}"
     expected = robots.load("cable-4").to_dict()
     expected["robot"] |= {"name": name, "modules": modules}
@@ -38,18 +38,18 @@ def test_a_cable_robot_of_any_number_of_modules_has_a_name(modules):
 
 
 @pytest.mark.parametrize("name", ["cable-1", "cable-65", "cable-0", "cable-", "cable-05", "pneumatic-4"])
-def test_no_robot_has_such_a_number_of_modules(name):
+def test_robot_with_an_invalid_number_of_modules_is_refused(name):
     with pytest.raises(RobotFileError, match=name):
         robots.load(name)
 
 
-def test_printed_robot_can_be_read_from_a_file(tmp_path):
+def test_text_of_a_shipped_robot_is_a_robot_file(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text(robots.text_of("pneumatic-3"))
     assert robots.load(path) == robots.load("pneumatic-3")
 
 
-def test_a_file_wins_over_a_shipped_name(tmp_path, monkeypatch):
+def test_file_takes_precedence_over_a_shipped_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cable-4").write_text(robots.text_of("cable-6"))
     assert robots.load("cable-4").modules == 6
@@ -61,7 +61,7 @@ def test_dict_round_trip():
         assert robots.from_dict(robot.to_dict()) == robot
 
 
-def test_frozen():
+def test_robot_is_frozen():
     with pytest.raises((AttributeError, dataclasses.FrozenInstanceError)):
         robots.load("cable-4").loop.hz = 3.0
 
@@ -101,7 +101,7 @@ PNEUMATIC = robots.text_of("pneumatic-3")
         ),
         (PNEUMATIC.replace("full_scale_bar = 3.0", "full_scale_bar = 0.3"), "p_min_bar < p_max_bar <= full_scale_bar"),
         (PNEUMATIC.replace("p_min_bar = 0.08", "p_min_bar = 0.5"), "p_min_bar < p_max_bar"),
-        (PNEUMATIC.replace("channel = 5", "channel = 4"), "channel 4 is given to two chambers"),
+        (PNEUMATIC.replace("channel = 5", "channel = 4"), "channel 4 is used by two chambers"),
         (
             PNEUMATIC.replace("channel = 5", "channel = 12"),
             r"channel under \[chambers number 6\]: found 12; expected .* at most 11$",
@@ -113,32 +113,32 @@ PNEUMATIC = robots.text_of("pneumatic-3")
         (robots.text_of("cable-4").replace('"cable"', '"pneumatic"'), "full_scale_bar"),
     ],
 )
-def test_every_mistake_is_one_line_that_names_it(text, expected):
+def test_every_error_is_one_line_that_names_the_key(text, expected):
     with pytest.raises(RobotFileError, match=expected) as caught:
         robots.parse(text, "robot.toml")
     assert str(caught.value).startswith("robot.toml: ")
     assert "\n" not in str(caught.value)
 
 
-def test_wrong_name_lists_the_shipped_robots(tmp_path, monkeypatch):
+def test_unknown_name_lists_the_shipped_robots(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RobotFileError, match="pneumatic-2, pneumatic-3"):
         robots.load("octopus")
 
 
-def test_a_folder_is_called_a_folder(tmp_path):
+def test_folder_is_refused(tmp_path):
     with pytest.raises(RobotFileError, match="is a folder, expected a robot file"):
         robots.load(tmp_path)
 
 
-def test_a_binary_file_is_refused(tmp_path):
+def test_binary_file_is_refused(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RobotFileError, match="UTF-8"):
         robots.load(path)
 
 
-def test_msgspec_keeps_unknown_keys_out_of_every_section():
+def test_every_section_refuses_unknown_keys():
     def sections(kind):
         yield kind
         for field in msgspec.structs.fields(kind):

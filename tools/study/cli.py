@@ -107,7 +107,7 @@ def write_report(folder: Path, to: Path | None) -> None:
     click.echo(output.report)
 
 
-main = entry(cli, goes_on=True)
+main = entry(cli, resumable=True)
 
 if __name__ == "__main__":
     main()
