@@ -41,7 +41,7 @@ def test_the_arcs_follow_the_simulated_robot(name, farthest_m):
     robot = robots.load(name)
     arm = Arm(robot.kind, robot.modules)
     arm.step(np.full((robot.modules, robot.action_size), 0.4), 0.4)
-    ends = coverage.module_ends(arm.configuration, arm.plant.module_length_m)
+    ends = coverage.module_ends(arm.configuration, arm.parameters.module_length_m)
     assert np.abs(arm.positions[:, 0]).max() > 3e-3
     assert np.linalg.norm(ends - arm.positions, axis=-1).max() < farthest_m
 

@@ -142,7 +142,7 @@ def test_pressures_follow_their_set_points_through_valve_and_chamber(pneumatic):
     set_points = np.array([[P_MAX_BAR, P_MIN_BAR], [0.0, P_MIN_BAR]])
     arm.set_pressures(set_points)
     elapsed_s = 0.0
-    valve_s, chamber_s = arm.plant.actuators.valve_lag_s, arm.plant.actuators.chamber_lag_s
+    valve_s, chamber_s = arm.parameters.actuators.valve_lag_s, arm.parameters.actuators.chamber_lag_s
     for _ in range(10):
         arm.advance(0.02)
         elapsed_s += 0.02
@@ -202,7 +202,7 @@ def test_longer_pneumatic_robots_stay_bounded(modules):
 
 def test_a_state_that_is_not_finite_is_one_clear_error(monkeypatch):
     too_large = dataclasses.replace(CABLE, time_step_s=1e-3)
-    monkeypatch.setitem(arm_module.PLANTS, "cable", too_large)
+    monkeypatch.setitem(arm_module.PARAMETERS, "cable", too_large)
     arm = Arm("cable", 2)
     with pytest.raises(ModsoftError, match=r"simulated cable robot of 2 modules is no longer finite"):
         arm.step(np.ones((2, 2)), 5.0)

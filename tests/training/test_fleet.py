@@ -11,7 +11,7 @@ from modsoft.runtime.errors import ModsoftError, UsageError
 from modsoft.training.simulation import fleet, fleet_kernel
 from modsoft.training.simulation.elastica import Arm
 from modsoft.training.simulation.fleet import Arms, Fleet
-from modsoft.training.simulation.parameters import PLANTS, Perturbation
+from modsoft.training.simulation.parameters import PARAMETERS, Perturbation
 from modsoft.training.simulation.rollout import rollout
 
 pytestmark = pytest.mark.instructions
@@ -82,7 +82,7 @@ def test_equals_pyelastica_for_other_module_numbers(kind, modules, periods):
     ],
 )
 def test_robots_off_the_drawing_equal_pyelastica_too(kind, modules, periods, stiffness, payload_modules):
-    changed = Perturbation(stiffness, payload_modules * PLANTS[kind].module_kg)
+    changed = Perturbation(stiffness, payload_modules * PARAMETERS[kind].module_kg)
     drawn = actions(kind, periods, 1, modules, seed=modules)
     robots = configurations(Fleet(kind, modules, 1, damping="explicit", perturbation=changed), drawn)[:, 0]
     arm = configurations(Arms(kind, modules, 1, perturbation=changed), drawn)[:, 0]
@@ -108,7 +108,7 @@ def test_a_softer_module_bends_further_and_the_others_much_as_before():
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_robots_off_the_drawing_stay_whole_under_full_range_jumps(modules, factor):
     drawn = np.random.default_rng(modules).choice([-1.0, 1.0], (3, 16, modules, 2))
-    robots = Fleet("cable", modules, 16, perturbation=Perturbation([factor] * modules, PLANTS["cable"].module_kg))
+    robots = Fleet("cable", modules, 16, perturbation=Perturbation([factor] * modules, PARAMETERS["cable"].module_kg))
     configurations(robots, drawn)
     assert robots.alive.all()
 
@@ -295,9 +295,9 @@ def test_pyelastica_serves_where_the_kernel_is_missing(monkeypatch, capsys):
     assert robots.alive.all()
 
 
-@pytest.mark.parametrize("kind", PLANTS)
+@pytest.mark.parametrize("kind", PARAMETERS)
 def test_opposite_cables_share_an_actuator_and_chambers_do_not(kind):
-    axes, places = fleet_kernel.places(PLANTS[kind])
+    axes, places = fleet_kernel.places(PARAMETERS[kind])
     assert len(axes) == 2
     assert axes == ([0, 1] if kind == "cable" else [0, 0])
     assert sorted(np.sign(places)) == ([1, 1] if kind == "cable" else [-1, 1])

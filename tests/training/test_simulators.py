@@ -114,7 +114,7 @@ def test_a_named_variant_gives_the_same_bits_everywhere():
     ("section", "key", "value", "message"),
     [
         ("loop", "hz", 3.0, r"loop.hz 3.0 .* expected whole steps of"),
-        ("valve", "p_max_bar", 0.5, r"0.08, 0.5; the simulated robot knows 0.08, 0.35 only"),
+        ("valve", "p_max_bar", 0.5, r"0.08, 0.5; expected 0.08, 0.35, the pressures of the simulated robot"),
     ],
 )
 def test_what_cannot_be_simulated_is_refused(section, key, value, message):

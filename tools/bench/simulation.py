@@ -30,7 +30,7 @@ from modsoft.runtime.errors import DeviceAbsent, ModsoftError, UsageError
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.elastica import Arm, _Loads, _Simulator
 from modsoft.training.simulation.fleet import Fleet
-from modsoft.training.simulation.parameters import PLANTS, PlantParameters
+from modsoft.training.simulation.parameters import PARAMETERS, PlantParameters
 
 OPERATIONS_PER_ELEMENT = {"cable": 417, "pneumatic": 435}
 ACTIONS = {"cable": 2, "pneumatic": 1}
@@ -45,7 +45,7 @@ class Block:
     """Eight robots as rods of one PyElastica memory block, with the rods and loads of as many `Arm`s."""
 
     def __init__(self, kind: str, modules: int, actuation: np.ndarray) -> None:
-        self.parameters = PLANTS[kind]
+        self.parameters = PARAMETERS[kind]
         self.simulator = _Simulator()
         for each in actuation:
             arm = Arm(kind, modules)
@@ -70,7 +70,7 @@ def turn_steps(parameters: PlantParameters) -> int:
 
 def turns(kind: str, modules: int, counts: list[int]) -> dict[str, tuple[int, Call]]:
     """What is timed for one kind and module number: name to (robots, a turn)."""
-    turn_s = turn_steps(PLANTS[kind]) * PLANTS[kind].time_step_s
+    turn_s = turn_steps(PARAMETERS[kind]) * PARAMETERS[kind].time_step_s
     actions = 0.5 * np.random.default_rng(modules).uniform(-1, 1, (max(*counts, BLOCK), modules, ACTIONS[kind]))
     arm = Arm(kind, modules)
     by_name: dict[str, tuple[int, Call]] = {
@@ -136,7 +136,7 @@ def measured(kinds: list[str], module_numbers: list[int], counts: list[int], rou
     peak = 2 * 12 * library.fleet_lanes(variant) * PEAK_ROUNDS / seconds.pop("peak")
     rows = []
     for (kind, modules), part in parts.items():
-        steps = turn_steps(PLANTS[kind])
+        steps = turn_steps(PARAMETERS[kind])
         us = {name: 1e6 * seconds[kind, modules, name] / steps / count for name, (count, _) in part.items()}
         rows += [figures(kind, modules, count, us, peak) for count in counts]
     return {
@@ -150,7 +150,7 @@ def measured(kinds: list[str], module_numbers: list[int], counts: list[int], rou
 def figures(kind: str, modules: int, count: int, us: dict[str, float], peak: float) -> dict[str, Any]:
     """The row of a fleet. us: microseconds of a time step of one robot by the name of its turn; peak: operations/s."""
     cost = us[f"fleet of {count}"]
-    operations = OPERATIONS_PER_ELEMENT[kind] * modules * PLANTS[kind].elements
+    operations = OPERATIONS_PER_ELEMENT[kind] * modules * PARAMETERS[kind].elements
     return {
         "kind": kind,
         "modules": modules,
@@ -190,7 +190,7 @@ def compared(kinds: list[str], module_numbers: list[int], periods: int) -> list[
 
 
 @click.command(help=__doc__)
-@click.option("--kind", "kinds", multiple=True, type=click.Choice(list(PLANTS)), help="Default: all.")
+@click.option("--kind", "kinds", multiple=True, type=click.Choice(list(PARAMETERS)), help="Default: all.")
 @report.isa_option
 @report.options("Fewer sizes and turns: less than a minute.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Write a picture here (PNG).")
@@ -211,7 +211,7 @@ def main(
         os.environ[fleet_kernel.LIMIT] = "avx2"
         if fleet_kernel.variants()[-1] != "avx2":
             raise UsageError("this processor has no AVX2, expected one that has; leave --isa out")
-    chosen = list(kinds or PLANTS)
+    chosen = list(kinds or PARAMETERS)
     if compare:
         rows = compared(chosen, [2, 4] if quick else [2, 3, 4, 6, 12], 5 if quick else 50)
         result: report.Result = {"about": report.about(), "compared": rows}

@@ -22,7 +22,7 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.errors import ModelError
 from modsoft.training import plotting
 from modsoft.training.data import dataset
-from modsoft.training.simulation.parameters import PLANTS
+from modsoft.training.simulation.parameters import PARAMETERS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -88,7 +88,7 @@ def compare(paths: list[Path]) -> list[Coverage]:
         different = ", ".join(sorted(f"{kind} with {modules} modules" for kind, modules in robots))
         raise ModelError(f"data sets of different robots ({different}); plot them one by one")
     kind, modules = robots.pop()
-    length_m = PLANTS[kind].module_length_m
+    length_m = PARAMETERS[kind].module_length_m
     samples = min(data.samples for data in sets)
     found = []
     for path, data in zip(paths, sets, strict=True):

@@ -1,4 +1,4 @@
-"""The robot in PyElastica: the reference that every faster model is held against.
+"""The robot in PyElastica: the reference for every faster simulation.
 
 One Cosserat rod for the whole arm, base clamped at the origin, axis +z, normal +x; position Verlet. All loads come
 from `loads.add_loads`, one compiled call a time step.
@@ -14,38 +14,38 @@ from modsoft.runtime.control.actuation import activations
 from modsoft.runtime.control.features import from_directors
 from modsoft.runtime.errors import ModsoftError
 from modsoft.training.simulation.loads import LoadConstants, Rod, add_loads, follow
-from modsoft.training.simulation.parameters import NOMINAL, PASCAL_PER_BAR, PLANTS, Perturbation, PlantParameters
+from modsoft.training.simulation.parameters import NOMINAL, PARAMETERS, PASCAL_PER_BAR, Perturbation, PlantParameters
 
 
 class _Simulator(elastica.BaseSystemCollection, elastica.Constraints, elastica.Forcing):
-    """PyElastica builds a simulation by mixing in what it needs."""
+    """PyElastica composes a simulation of mix-in classes."""
 
 
 class _Loads(elastica.NoForces):
     """Applies `add_loads`, and the lags of the pressures, in every time step."""
 
-    def __init__(self, plant: PlantParameters, state: dict[str, Array]) -> None:
+    def __init__(self, parameters: PlantParameters, state: dict[str, Array]) -> None:
         super().__init__()
-        actuators = plant.actuators
+        actuators = parameters.actuators
         angles = np.radians(actuators.angles_deg)
         # Rounded because cos(90 degrees) is 6e-17, which would let a planar arm leave its plane.
         directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=-1), 15)
-        scale = plant.radius_m * plant.module_length_m / plant.elements
+        scale = parameters.radius_m * parameters.module_length_m / parameters.elements
         constants = LoadConstants(
-            plant.gravity_m_s2,
-            plant.damping_n_s_m2,
-            plant.torque_damping_n_s,
-            0.5 * np.array([plant.drag_transverse, plant.drag_axial]) / scale,
+            parameters.gravity_m_s2,
+            parameters.damping_n_s_m2,
+            parameters.torque_damping_n_s,
+            0.5 * np.array([parameters.drag_transverse, parameters.drag_axial]) / scale,
             actuators.offset_ratio * directions,
-            np.full(len(angles), actuators.area_ratio * np.pi * plant.radius_m**2),
+            np.full(len(angles), actuators.area_ratio * np.pi * parameters.radius_m**2),
             np.array(actuators.weight),
             actuators.longest,
-            np.array([plant.friction_n_m2, plant.friction_curvature_per_m]),
+            np.array([parameters.friction_n_m2, parameters.friction_curvature_per_m]),
         )
         self._constants = tuple(constants)
         self._state = state
         lags = np.array([actuators.valve_lag_s, actuators.chamber_lag_s])
-        self._gains = tuple(1.0 - np.exp(-plant.time_step_s / lags)) if lags.any() else None
+        self._gains = tuple(1.0 - np.exp(-parameters.time_step_s / lags)) if lags.any() else None
 
     def apply_forces(self, system: elastica.CosseratRod, time: float = 0.0) -> None:
         state = self._state
@@ -58,42 +58,42 @@ class _Loads(elastica.NoForces):
 class Arm:
     """A robot of `modules` modules of one kind (`cable` or `pneumatic`), starting at rest at activation 0.
 
-    kind: a key of `robots.PLANTS`. Activation 0 of a pneumatic arm is its lower pressure, not a vented chamber. A wrong
+    kind: a key of `PARAMETERS`. Activation 0 of a pneumatic arm is its lower pressure, not a vented chamber. A wrong
     shape, an actuation outside [-1, 1] or pressures on a cable robot raise ValueError.
 
-    A pneumatic arm is simulated as a rod in space too, loads and start in the x-z plane: its motion then stays in the
-    plane by itself, exactly, because every force out of it is a sum of zeros.
+    A pneumatic arm is simulated as a rod in space too, with loads and start in the x-z plane. Its motion stays
+    exactly in the plane, because every force out of it is a sum of zeros.
     """
 
     def __init__(self, kind: str, modules: int, *, perturbation: Perturbation = NOMINAL) -> None:
         self.kind = kind
         self.modules = modules
-        self.plant, self._stiffness = PLANTS[kind].perturbed(modules, perturbation)
+        self.parameters, self._stiffness = PARAMETERS[kind].perturbed(modules, perturbation)
         self._time_s = np.float64(0.0)
-        self._owed_s = 0.0
+        self._remainder_s = 0.0
         self._build()
         self._keep_rest()
 
     @property
     def configuration(self) -> Array:
-        """Configurations (N, 3), [v_x, v_y, v_z]: d3 of each module's last element in the frame of the one before."""
+        """Configurations (N, 3), [v_x, v_y, v_z]: d3 of each module's last element in the frame of the previous one."""
         return from_directors(self.directors)
 
     @property
     def positions(self) -> Array:
         """Module ends (N, 3), m."""
-        every = self.plant.elements
+        every = self.parameters.elements
         return self._rod.position_collection[:, every::every].T.copy()
 
     @property
     def directors(self) -> Array:
         """Frames of each module's last element (N, 3, 3), rows d1, d2, d3 in the lab frame."""
-        every = self.plant.elements
+        every = self.parameters.elements
         return np.moveaxis(self._rod.director_collection[:, :, every - 1 :: every], -1, 0).copy()
 
     @property
     def pressures(self) -> Array:
-        """Pressures in the chambers (N, 2), bar, sides + and -, after the lag of valve and chamber."""
+        """Pressures in the chambers (N, 2), bar, sides + and -, after the lags of valve and chamber."""
         self._pneumatic_only()
         return self._state["stress_pa"] / -PASCAL_PER_BAR
 
@@ -103,26 +103,26 @@ class Arm:
         self._state["set_pa"][:] = -PASCAL_PER_BAR * self._shaped(bar)
 
     def step(self, actuation: Array, period_s: float | None = None) -> Array:
-        """One control period (the plant's own by default) of `actuation` (N, A) in [-1, 1]; the configuration after."""
+        """One control period (by default that of the parameters) of `actuation` (N, A); the configuration after it."""
         actuation = self._shaped(actuation, channels_per_action=2)
         if not (np.abs(actuation) <= 1.0).all():
             raise ValueError(f"found an actuation of {actuation[~(np.abs(actuation) <= 1.0)][0]}, expected [-1, 1]")
         activation = activations(actuation)
-        actuators = self.plant.actuators
+        actuators = self.parameters.actuators
         span = actuators.full_stress_pa - actuators.rest_stress_pa
         self._state["set_pa"][:] = actuators.rest_stress_pa + span * activation
-        self.advance(self.plant.period_s if period_s is None else period_s)
+        self.advance(self.parameters.period_s if period_s is None else period_s)
         return self.configuration
 
     def advance(self, duration_s: float) -> None:
-        """Advances by `duration_s`, seconds, in whole time steps; what is left over is owed to the next call.
+        """Advances by `duration_s`, seconds, in whole time steps; the remainder is added to the next call.
 
-        Raises `ModsoftError` when the robot's state is no longer finite.
+        Raises `ModsoftError` when the simulation diverges.
         """
-        step_s = self.plant.time_step_s
-        self._owed_s += duration_s
-        steps = round(self._owed_s / step_s)
-        self._owed_s -= steps * step_s
+        step_s = self.parameters.time_step_s
+        self._remainder_s += duration_s
+        steps = round(self._remainder_s / step_s)
+        self._remainder_s -= steps * step_s
         for _ in range(steps):
             self._time_s = self._stepper.step(self._simulator, self._time_s, step_s)
         if not np.isfinite(self._rod.position_collection).all():
@@ -132,52 +132,52 @@ class Arm:
             )
 
     def reset(self) -> None:
-        """Back to rest, exactly as built."""
+        """Sets the state to rest, exactly as after construction."""
         for array, rest in self._rest:
             array[:] = rest
         self._time_s = np.float64(0.0)
-        self._owed_s = 0.0
+        self._remainder_s = 0.0
 
     def _build(self) -> None:
-        plant = self.plant
-        channels = (self.modules, len(plant.actuators.angles_deg))
-        elements = self.modules * plant.elements
-        start = np.full(channels, plant.actuators.rest_stress_pa)
-        # A cable has no lag: its set-point is its stress, in one array.
+        parameters = self.parameters
+        channels = (self.modules, len(parameters.actuators.angles_deg))
+        elements = self.modules * parameters.elements
+        start = np.full(channels, parameters.actuators.rest_stress_pa)
+        # A cable has no lag: set-point and stress are one array.
         self._state = {"set_pa": start, "slip": np.zeros((2, elements - 1))}
-        lags = plant.actuators.valve_lag_s > 0
+        lags = parameters.actuators.valve_lag_s > 0
         self._state |= {name: start.copy() if lags else start for name in ("valve_pa", "stress_pa")}
         rod = elastica.CosseratRod.straight_rod(
             n_elements=elements,
             start=np.zeros(3),
             direction=np.array([0.0, 0.0, 1.0]),
             normal=np.array([1.0, 0.0, 0.0]),
-            base_length=self.modules * plant.module_length_m,
-            base_radius=plant.radius_m,
-            density=plant.density_kg_m3,
-            youngs_modulus=plant.youngs_modulus_pa,
+            base_length=self.modules * parameters.module_length_m,
+            base_radius=parameters.radius_m,
+            density=parameters.density_kg_m3,
+            youngs_modulus=parameters.youngs_modulus_pa,
         )
-        rod.shear_matrix[2, 2] *= plant.axial_ratio
+        rod.shear_matrix[2, 2] *= parameters.axial_ratio
         rod.shear_matrix *= self._stiffness
-        rod.bend_matrix *= plant.bend_ratios(self._stiffness)
-        rod.mass_second_moment_of_inertia *= plant.rotary_inertia_ratio
-        rod.inv_mass_second_moment_of_inertia /= plant.rotary_inertia_ratio
-        rod.mass[plant.elements :: plant.elements] += plant.connector_mass_kg
-        rod.mass[-1] += plant.tip_mass_kg - plant.connector_mass_kg
+        rod.bend_matrix *= parameters.bend_ratios(self._stiffness)
+        rod.mass_second_moment_of_inertia *= parameters.rotary_inertia_ratio
+        rod.inv_mass_second_moment_of_inertia /= parameters.rotary_inertia_ratio
+        rod.mass[parameters.elements :: parameters.elements] += parameters.connector_mass_kg
+        rod.mass[-1] += parameters.tip_mass_kg - parameters.connector_mass_kg
         simulator = _Simulator()
         simulator.append(rod)
         simulator.constrain(rod).using(
             elastica.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)
         )
-        simulator.add_forcing_to(rod).using(_Loads, plant, self._state)
+        simulator.add_forcing_to(rod).using(_Loads, parameters, self._state)
         simulator.finalize()
         self._simulator, self._rod = simulator, rod
         self._stepper = elastica.PositionVerlet()
 
     def _keep_rest(self) -> None:
-        """Lets the arm settle under its weight, then keeps what `reset` puts back."""
+        """Lets the arm settle under its weight, then stores the state for `reset`."""
         rod = self._rod
-        for duration_s in self.plant.settling_slices_s():
+        for duration_s in self.parameters.settling_slices_s():
             self.advance(duration_s)
             rod.velocity_collection[:] = 0.0
             rod.omega_collection[:] = 0.0
@@ -187,7 +187,7 @@ class Arm:
 
     def _shaped(self, values: Array, channels_per_action: int = 1) -> Array:
         values = np.asarray(values, dtype=np.float64)
-        expected = (self.modules, len(self.plant.actuators.angles_deg) // channels_per_action)
+        expected = (self.modules, len(self.parameters.actuators.angles_deg) // channels_per_action)
         if values.shape != expected:
             raise ValueError(f"found shape {values.shape}, expected {expected} for this {self.kind} robot")
         return values

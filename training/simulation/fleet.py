@@ -1,8 +1,8 @@
-"""Many robots at once: `Fleet` advances independent robots together, each as `arm.Arm` would be.
+"""Simulation of many robots at once: `Fleet` advances independent robots, each as `elastica.Arm` would.
 
-The kernel is C (fleet.c): robots are the lanes of SIMD vectors and share nothing, so that the numbers of a robot do not
-depend on its place or on how many there are (on one processor; another vector width may round differently). Built from
-the same parameters as the PyElastica robot, which stays the definition.
+The kernel is C (fleet.c). Robots are the lanes of SIMD vectors and share nothing, so that the numbers of a robot do not
+depend on its position or on the number of robots (on one processor; another vector width may round differently). The
+parameters are those of the PyElastica robot, which is the reference.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from modsoft.runtime.control.features import from_directors
 from modsoft.runtime.errors import ModsoftError
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.fleet_kernel import Damping
-from modsoft.training.simulation.parameters import NOMINAL, PLANTS, Perturbation
+from modsoft.training.simulation.parameters import NOMINAL, PARAMETERS, Perturbation
 
-# What stands in memory for one element, in vectors: `struct element` and `struct drive` of fleet_kernel.h.
+# Layout of one element in memory, in vectors: `struct element` and `struct drive` of fleet_kernel.h.
 _ELEMENT = 20
 _POSITION, _VELOCITY, _DIRECTOR, _OMEGA, _SLIP = slice(0, 3), slice(3, 6), slice(6, 15), slice(15, 18), slice(18, 20)
 _GOAL, _VALVE, _FORCE, _PLACE = range(4)
 
 
 def _aligned(shape: tuple[int, ...]) -> Array:
-    """Zeros that start on a cache line: a vector that straddles two costs a fifth of the speed."""
+    """Zeros that start on a cache line: vectors across two lines cost a fifth of the speed."""
     size = math.prod(shape)
     buffer = np.zeros(size + 8)
     start = -buffer.ctypes.data // 8 % 8
@@ -40,7 +40,7 @@ def _aligned(shape: tuple[int, ...]) -> Array:
 
 
 class Snapshot(NamedTuple):
-    """The robots of a fleet at one moment, robot first."""
+    """The complete states of B robots."""
 
     state: Array  # (B, elements + 1, 20)
     drive: Array  # (B, N, actuators, 4)
@@ -49,12 +49,12 @@ class Snapshot(NamedTuple):
 class Fleet:
     """`count` robots of one kind and one module number, starting at rest at activation 0.
 
-    damping: how the damping of the rotation is integrated. `explicit` is the recorded runs' and PyElastica's; at the
-    cable robot's 2.5e-4 s it is only just stable, and loses some long robots at a first large action. `exponential` is
-    stable, for data; on the recorded runs its configurations differ by 4e-7 of the unit vector in the mean, and by 8e-5
-    after the jump from rest that task B begins with.
+    damping: integration of the rotational damping. `explicit` is that of the recorded runs and of PyElastica; with the
+    cable robot's time step of 2.5e-4 s it is only just stable, and some long robots diverge at a first large action.
+    `exponential` is stable, for data; on the recorded runs its configurations differ by 4e-7 of the unit vector in the
+    mean, and by 8e-5 after the jump from rest at the start of task B.
 
-    threads: work on that many blocks of robots (of `lanes` each) at a time; the numbers stay the same.
+    threads: number of threads, which share the blocks of `lanes` robots; the numbers do not depend on it.
 
     perturbation: the same for all robots of the fleet.
     """
@@ -81,23 +81,28 @@ class Fleet:
         self._library = library
         self.lanes: int = library.fleet_lanes(self._variant)
         self.kind, self.modules, self.count, self.damping = kind, modules, count, damping
-        self.plant, self._stiffness = PLANTS[kind].perturbed(modules, perturbation)
-        self.time_step_s = self.plant.time_step_s if time_step_s is None else time_step_s
-        self._alternate = fleet_kernel.alternate(self.plant)
-        elements = modules * self.plant.elements
-        area = math.pi * self.plant.radius_m**2
-        mass = np.full(elements + 1, self.plant.density_kg_m3 * area * self.plant.module_length_m / self.plant.elements)
+        self.parameters, self._stiffness = PARAMETERS[kind].perturbed(modules, perturbation)
+        self.time_step_s = self.parameters.time_step_s if time_step_s is None else time_step_s
+        self._alternate = fleet_kernel.alternate(self.parameters)
+        elements = modules * self.parameters.elements
+        area = math.pi * self.parameters.radius_m**2
+        mass = np.full(
+            elements + 1,
+            self.parameters.density_kg_m3 * area * self.parameters.module_length_m / self.parameters.elements,
+        )
         mass[[0, -1]] *= 0.5
-        mass[self.plant.elements :: self.plant.elements] += self.plant.connector_mass_kg
-        mass[-1] += self.plant.tip_mass_kg - self.plant.connector_mass_kg
+        mass[self.parameters.elements :: self.parameters.elements] += self.parameters.connector_mass_kg
+        mass[-1] += self.parameters.tip_mass_kg - self.parameters.connector_mass_kg
         # The kernel's units: the rest length of an element, the time step, newton.
-        self._rest_length_m = self.plant.module_length_m / self.plant.elements
-        self._places = 0.5 * self.plant.radius_m / self._rest_length_m * np.array(fleet_kernel.places(self.plant)[1])
+        self._rest_length_m = self.parameters.module_length_m / self.parameters.elements
+        self._places = (
+            0.5 * self.parameters.radius_m / self._rest_length_m * np.array(fleet_kernel.places(self.parameters)[1])
+        )
         self._mobility = self.time_step_s**2 / self._rest_length_m / mass
-        self._rigidity = self.plant.bend_ratios(self._stiffness)
+        self._rigidity = self.parameters.bend_ratios(self._stiffness)
         self._constants = self._with_arrays(damping)
-        # Newtons of a pascal at weight 1.
-        self._section_m2 = self.plant.actuators.area_ratio * area
+        # Force of a stress of 1 Pa at weight 1.
+        self._section_m2 = self.parameters.actuators.area_ratio * area
         self._thread_count = threads
         self._threads = ThreadPoolExecutor(threads) if threads > 1 else None
         self._rest = self._settled()
@@ -108,77 +113,78 @@ class Fleet:
 
     @property
     def configuration(self) -> Array:
-        """Configurations (B, N, 3), [v_x, v_y, v_z]; not a number for a robot that was lost."""
+        """Configurations (B, N, 3), [v_x, v_y, v_z]."""
         return from_directors(self.directors)
 
     @property
     def positions(self) -> Array:
-        """Module ends (B, N, 3), m."""
-        every = self.plant.elements
-        ends = np.moveaxis(self._state[:, every::every, _POSITION], -1, 1)
+        """Ends of the modules (B, N, 3), m."""
+        elements = self.parameters.elements
+        ends = np.moveaxis(self._state[:, elements::elements, _POSITION], -1, 1)
         return ends.reshape(-1, self.modules, 3)[: self.count] * self._rest_length_m
 
     @property
     def directors(self) -> Array:
-        """Frames of each module's last element (B, N, 3, 3), rows d1, d2, d3 in the lab frame."""
-        every = self.plant.elements
-        ends = np.moveaxis(self._state[:, every - 1 : -1 : every, _DIRECTOR], -1, 1)
-        return ends.reshape(-1, self.modules, 3, 3)[: self.count].copy()  # of one block it would be a view
+        """Frames of the modules' last elements (B, N, 3, 3), rows d1, d2, d3 in the lab frame."""
+        elements = self.parameters.elements
+        ends = np.moveaxis(self._state[:, elements - 1 : -1 : elements, _DIRECTOR], -1, 1)
+        return ends.reshape(-1, self.modules, 3, 3)[: self.count].copy()  # of a single block it would be a view
 
     @property
     def alive(self) -> NDArray[np.bool_]:
-        """(B,): the robots whose state is finite, every element of it. The others are lost until they are reset."""
+        """(B,): whether a robot's state is finite in all elements. The others have diverged, until they are reset."""
         return np.isfinite(self._state).all(axis=(1, 2)).reshape(-1)[: self.count]
 
     def reset(self, indices: Sequence[int] | NDArray[np.integer] | None = None) -> None:
-        """Robots `indices` (all by default) back to rest; the others go on."""
+        """Sets robots `indices` (all by default) to rest."""
         self.restore(self._rest, np.arange(self._state.shape[0] * self.lanes) if indices is None else indices)
 
     def snapshot(self, indices: Sequence[int] | NDArray[np.integer] | None = None) -> Snapshot:
-        """Everything that the motion of robots `indices` (all by default) depends on, to go on from there later."""
+        """The states of robots `indices` (all by default), from which their motion can continue later."""
         block, lane = np.divmod(np.arange(self.count) if indices is None else np.asarray(indices), self.lanes)
         return Snapshot(self._state[block, :, :, lane], self._drive[block, :, :, :, lane])
 
     def restore(self, snapshot: Snapshot, indices: Sequence[int] | NDArray[np.integer] | None = None) -> None:
-        """Puts robots `indices` (all by default) where `snapshot` was taken, one of it each; a snapshot of one robot
-        goes to all of them."""
+        """Sets robots `indices` (all by default) to the states of `snapshot`, one each, or all to the state of one."""
         block, lane = np.divmod(np.arange(self.count) if indices is None else np.asarray(indices), self.lanes)
         self._state[block, :, :, lane] = snapshot.state
         self._drive[block, :, :, :, lane] = snapshot.drive
 
     def step(self, actuation: Array, period_s: float | None = None) -> None:
-        """One control period (the plant's own by default) of `actuation` (B, N, A) in [-1, 1]."""
+        """One control period (by default that of the parameters) with `actuation` (B, N, A) in [-1, 1]."""
         actuation = np.asarray(actuation, dtype=np.float64)
-        expected = (self.count, self.modules, len(self.plant.actuators.angles_deg) // 2)
+        expected = (self.count, self.modules, len(self.parameters.actuators.angles_deg) // 2)
         if actuation.shape != expected:
             raise ValueError(f"found actuation of shape {actuation.shape}, expected {expected} for this fleet")
         if not (np.abs(actuation) <= 1.0).all():
             raise ValueError(f"found an actuation of {actuation[~(np.abs(actuation) <= 1.0)][0]}, expected [-1, 1]")
         self._set(self._drive, actuation)
-        self._advance(self._constants, self._state, self._drive, self.plant.period_s if period_s is None else period_s)
+        self._advance(
+            self._constants, self._state, self._drive, self.parameters.period_s if period_s is None else period_s
+        )
 
     def _with_arrays(self, damping: Damping) -> fleet_kernel.PlantStruct:
-        plant = fleet_kernel.constants(self.plant, damping, self.time_step_s)
-        plant.mobility = self._mobility.ctypes.data
-        plant.stiffness = self._stiffness.ctypes.data
-        plant.rigidity = self._rigidity.ctypes.data
-        return plant
+        parameters = fleet_kernel.constants(self.parameters, damping, self.time_step_s)
+        parameters.mobility = self._mobility.ctypes.data
+        parameters.stiffness = self._stiffness.ctypes.data
+        parameters.rigidity = self._rigidity.ctypes.data
+        return parameters
 
     def _set(self, drive: Array, actuation: Array) -> None:
-        """Eq. (3), stress and force, and where each actuator stands, into the lanes of `drive`."""
-        actuators = self.plant.actuators
+        """Writes the forces of an actuation (eq. 3) and the positions of the actuators into the lanes of `drive`."""
+        actuators = self.parameters.actuators
         span = actuators.full_stress_pa - actuators.rest_stress_pa
         force = self._section_m2 * (actuators.rest_stress_pa + span * activations(actuation))
         places = np.broadcast_to(self._places, (*actuation.shape[:2], len(self._places)))
         if self._alternate:
             force = force[..., ::2] + force[..., 1::2]  # one of them is zero
             places = np.where(actuation < 0.0, -places, places)
-        for slot, values in ((_GOAL if self._constants.lags else _FORCE, force), (_PLACE, places)):
+        for row, values in ((_GOAL if self._constants.lags else _FORCE, force), (_PLACE, places)):
             padded = np.zeros((drive.shape[0] * self.lanes, *values.shape[1:]))
             padded[: len(values)] = values
-            drive[:, :, :, slot] = np.moveaxis(padded.reshape(-1, self.lanes, *values.shape[1:]), 1, -1)
+            drive[:, :, :, row] = np.moveaxis(padded.reshape(-1, self.lanes, *values.shape[1:]), 1, -1)
 
-    def _advance(self, plant: fleet_kernel.PlantStruct, state: Array, drive: Array, duration_s: float) -> None:
+    def _advance(self, parameters: fleet_kernel.PlantStruct, state: Array, drive: Array, duration_s: float) -> None:
         steps = round(duration_s / self.time_step_s)
         if not math.isclose(steps * self.time_step_s, duration_s, rel_tol=1e-9):
             raise ValueError(f"{duration_s} s is not a whole number of time steps of {self.time_step_s} s")
@@ -186,10 +192,10 @@ class Fleet:
         def advance(block: slice) -> None:
             self._library.fleet_advance(
                 self._variant,
-                ctypes.byref(plant),
+                ctypes.byref(parameters),
                 len(state[block]),
                 self.modules,
-                self.plant.elements,
+                self.parameters.elements,
                 drive[block].ctypes.data,
                 state[block].ctypes.data,
                 steps,
@@ -198,31 +204,31 @@ class Fleet:
         if self._threads is None:
             advance(slice(None))
         else:
-            # A contiguous part each: handed out block by block, two threads gained 1.5 times in place of 1.9.
+            # One contiguous part for each thread: with single blocks two threads were 1.5 times as fast, not 1.9 times.
             borders = np.linspace(0, len(state), self._thread_count + 1).round().astype(int)
             list(self._threads.map(advance, map(slice, borders[:-1], borders[1:])))
 
     def _settled(self) -> Snapshot:
         """One robot at rest, hanging under its weight."""
-        elements = self.modules * self.plant.elements
+        elements = self.modules * self.parameters.elements
         state = _aligned((1, elements + 1, _ELEMENT, self.lanes))
         drive = _aligned((1, self.modules, len(self._places), 4, self.lanes))
         state[0, :, 2] = np.arange(elements + 1.0)[:, None]
         state[0, :, _DIRECTOR] = np.eye(3).reshape(9, 1)
-        self._set(drive, np.zeros((self.lanes, self.modules, len(self.plant.actuators.angles_deg) // 2)))
+        self._set(drive, np.zeros((self.lanes, self.modules, len(self.parameters.actuators.angles_deg) // 2)))
         if self._constants.lags:
             drive[:, :, :, _VALVE] = drive[:, :, :, _FORCE] = drive[:, :, :, _GOAL]
-        # A robot that hangs straight does not turn, so that the damping of the rotation plays no part, but explicit
-        # damping would let rounding grow while it falls.
+        # A robot that hangs straight does not rotate, so that the damping of rotation has no effect; but with explicit
+        # damping rounding errors would grow while it falls.
         damped = self._with_arrays("exponential")
-        for duration_s in self.plant.settling_slices_s():
+        for duration_s in self.parameters.settling_slices_s():
             self._advance(damped, state, drive, duration_s)
             state[:, :, _VELOCITY] = state[:, :, _OMEGA] = 0.0
         return Snapshot(state[..., 0].copy(), drive[..., 0].copy())
 
 
 class Arms:
-    """`Fleet`'s interface on robots in PyElastica, one after the other; damping always explicit."""
+    """Robots in PyElastica with the interface of `Fleet`, one after the other; the damping is always explicit."""
 
     damping: Damping = "explicit"
 
@@ -262,9 +268,12 @@ class Arms:
 def simulated(
     kind: str, modules: int, count: int, damping: Damping = "exponential", *, perturbation: Perturbation = NOMINAL
 ) -> Fleet | Arms:
-    """`count` robots at rest, on the fastest plant that this installation has. Where it has no kernel, PyElastica
-    serves, and standard error is told in one line."""
+    """`count` robots at rest in the fastest simulation of this installation. Without the compiled kernel that is
+    PyElastica, with one line on standard error."""
     if fleet_kernel.library() is not None:
         return Fleet(kind, modules, count, damping, perturbation=perturbation)
-    print("the fast plant is not built (no C compiler at installation?): PyElastica simulates, slower", file=sys.stderr)
+    print(
+        "the fast simulator is not built (no C compiler at installation?): PyElastica simulates, slower",
+        file=sys.stderr,
+    )
     return Arms(kind, modules, count, perturbation=perturbation)

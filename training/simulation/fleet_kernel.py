@@ -1,4 +1,4 @@
-"""The compiled kernel of `fleet.py`: where it is, which variants run here, and the plant in the form that it takes."""
+"""The compiled kernel of `fleet.py`: its library, the variants that run here, and its form of the parameters."""
 
 from __future__ import annotations
 
@@ -50,53 +50,56 @@ class PlantStruct(ctypes.Structure):
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The compiled kernel, or None where this installation has none (no C compiler when it was made)."""
+    """The compiled kernel, or None where this installation has none (no C compiler at installation)."""
     spec = importlib.util.find_spec("modsoft.training.simulation._fleet")
     if spec is None or spec.origin is None:
         return None
-    found = ctypes.CDLL(spec.origin)
-    if found.fleet_plant_bytes() != ctypes.sizeof(PlantStruct):
+    kernel = ctypes.CDLL(spec.origin)
+    if kernel.fleet_plant_bytes() != ctypes.sizeof(PlantStruct):
         raise ModsoftError(f"{spec.origin} is not of this version of modsoft; install it again (make install)")
     integer, pointer = ctypes.c_int, ctypes.c_void_p
-    found.fleet_advance.argtypes = [integer, pointer, integer, integer, integer, *[pointer] * 2, ctypes.c_long]
-    found.fleet_advance.restype = None
-    found.fleet_peak.argtypes = [ctypes.c_int, ctypes.c_long]
-    found.fleet_peak.restype = ctypes.c_double
-    return found
+    kernel.fleet_advance.argtypes = [integer, pointer, integer, integer, integer, *[pointer] * 2, ctypes.c_long]
+    kernel.fleet_advance.restype = None
+    kernel.fleet_peak.argtypes = [ctypes.c_int, ctypes.c_long]
+    kernel.fleet_peak.restype = ctypes.c_double
+    return kernel
 
 
 def variants() -> list[str]:
     """The variants of the kernel that run here, the fastest last; empty without a kernel.
 
-    These are the ones that the processor has, up to the one that the environment variable `MODSOFT_KERNEL` names. A
-    limit above what the processor has changes nothing. `UsageError` if it names no variant.
+    These are the variants for the instructions of this processor, up to the one in the environment variable
+    `MODSOFT_KERNEL`, if it is set. Raises `UsageError` where that is no variant.
     """
     limit = os.environ.get(LIMIT) or VARIANTS[-1]
     if limit not in VARIANTS:
         raise UsageError(f"{LIMIT} is {limit!r}, expected {', '.join(VARIANTS)}; unset it to use the fastest")
-    found = library()
+    kernel = library()
     allowed = VARIANTS[: VARIANTS.index(limit) + 1]
-    return [] if found is None else [name for i, name in enumerate(allowed) if found.fleet_lanes(i)]
+    return [] if kernel is None else [name for i, name in enumerate(allowed) if kernel.fleet_lanes(i)]
 
 
-def constants(plant: PlantParameters, damping: Damping, time_step_s: float) -> PlantStruct:
-    """The plant in the kernel's units, without the three arrays. The rod's own numbers are PyElastica's: a disk's
-    second moments, 27/28 for the shear of a section, a third of Young's modulus for shear."""
-    length = plant.module_length_m / plant.elements
-    area = math.pi * plant.radius_m**2
+def constants(parameters: PlantParameters, damping: Damping, time_step_s: float) -> PlantStruct:
+    """The parameters in the kernel's units, without the three arrays.
+
+    Those of the rod are PyElastica's: a disk's second moments, 27/28 for the shear of a section, a third of Young's
+    modulus for shear.
+    """
+    length = parameters.module_length_m / parameters.elements
+    area = math.pi * parameters.radius_m**2
     moment = area**2 / (4 * math.pi)
-    young, shear = plant.youngs_modulus_pa, plant.youngs_modulus_pa / 3
-    inertia = plant.rotary_inertia_ratio * plant.density_kg_m3 * length * moment
+    young, shear = parameters.youngs_modulus_pa, parameters.youngs_modulus_pa / 3
+    inertia = parameters.rotary_inertia_ratio * parameters.density_kg_m3 * length * moment
     inertias = (inertia, 2 * inertia)
-    # Explicit: the damping torque is kicked like any other. Exponential: each kick is weighted as the exact solution of
-    # dw/dt = a - c w weights a, which is stable at any c; c at rest length.
+    # Explicit: the damping torque is integrated like any other. Exponential: each kick has the weight of `a` in the
+    # exact solution of dw/dt = a - c w, which is stable at any c; c at rest length.
     kick = [time_step_s] * 2
     if damping == "exponential":
-        rates = [plant.torque_damping_n_s * length / each for each in inertias]
+        rates = [parameters.torque_damping_n_s * length / each for each in inertias]
         kick = [-math.expm1(-rate * time_step_s) / rate if rate else time_step_s for rate in rates]
     velocity = length / time_step_s  # its unit, m/s
-    actuators = plant.actuators
-    axes, _ = places(plant)
+    actuators = parameters.actuators
+    axes, _ = places(parameters)
     lags = (actuators.valve_lag_s, actuators.chamber_lag_s)
     shares = [1.0 - math.exp(-time_step_s / lag) if lag else 1.0 for lag in lags]
     if len(actuators.weight) > 4:
@@ -106,33 +109,35 @@ def constants(plant: PlantParameters, damping: Damping, time_step_s: float) -> P
         lags=any(lags),
         tiny=1e-14 / length,
         shear=27 / 28 * shear * area,
-        stretch=plant.axial_ratio * young * area,
+        stretch=parameters.axial_ratio * young * area,
         bend=(2 * young * moment / length**2, 4 * shear * moment / length**2),
-        half_damping=-0.5 * plant.damping_n_s_m2 * length * (0.5 * velocity),
-        drag=tuple(0.5 * each * (0.5 * velocity) ** 2 for each in (plant.drag_transverse, plant.drag_axial)),
+        half_damping=-0.5 * parameters.damping_n_s_m2 * length * (0.5 * velocity),
+        drag=tuple(0.5 * each * (0.5 * velocity) ** 2 for each in (parameters.drag_transverse, parameters.drag_axial)),
         weight=(*actuators.weight, 0.0, 0.0, 0.0)[:4],
         longest=actuators.longest,
         valve_share=shares[0],
         chamber_share=shares[1],
-        friction=2 * plant.friction_n_m2 / length**2,
-        friction_curvature=0.5 * plant.friction_curvature_per_m * length,
-        gravity_kick=time_step_s * plant.gravity_m_s2 / velocity,
+        friction=2 * parameters.friction_n_m2 / length**2,
+        friction_curvature=0.5 * parameters.friction_curvature_per_m * length,
+        gravity_kick=time_step_s * parameters.gravity_m_s2 / velocity,
         gyration=tuple(each / time_step_s for each in kick),
         turn_kick=tuple(each * time_step_s * length / j for each, j in zip(kick, inertias, strict=True)),
-        fade_kick=tuple(each * plant.torque_damping_n_s * length / j for each, j in zip(kick, inertias, strict=True)),
+        fade_kick=tuple(
+            each * parameters.torque_damping_n_s * length / j for each, j in zip(kick, inertias, strict=True)
+        ),
     )
 
 
-def places(plant: PlantParameters) -> tuple[list[int], list[float]]:
-    """Axis (0 or 1) and place (radii along it) of the actuators that act at a time.
+def places(parameters: PlantParameters) -> tuple[list[int], list[float]]:
+    """Axis (0 or 1) and position (radii along it) of the actuators that can act at a time.
 
-    Of two opposite cables only one pulls, so that the pair is one actuator that changes sides: place of the first.
+    Of two opposite cables only one pulls, so that the pair is one actuator that changes sides: position of the first.
     """
-    actuators = plant.actuators
+    actuators = parameters.actuators
     degrees = np.array(actuators.angles_deg) % 360.0
     if not np.isin(degrees, (0.0, 90.0, 180.0, 270.0)).all():
         raise ModsoftError(f"actuators at {actuators.angles_deg} degrees; expected 0, 90, 180 or 270")
-    if alternate(plant):
+    if alternate(parameters):
         degrees = degrees[::2]
     axes = [int(each) for each in degrees // 90.0 % 2]
     if axes not in ([0, 0], [0, 1]):
@@ -141,8 +146,8 @@ def places(plant: PlantParameters) -> tuple[list[int], list[float]]:
     return axes, [float(each) for each in actuators.offset_ratio * signs]
 
 
-def alternate(plant: PlantParameters) -> bool:
-    """Whether of two channels in a row never both are under stress, and they stand on opposite sides."""
-    actuators = plant.actuators
+def alternate(parameters: PlantParameters) -> bool:
+    """Whether of each two successive channels only one is under stress at a time, and they are on opposite sides."""
+    actuators = parameters.actuators
     apart = np.diff(np.array(actuators.angles_deg).reshape(-1, 2), axis=-1) % 360.0
     return actuators.rest_stress_pa == 0 and actuators.valve_lag_s == 0 and bool((apart == 180.0).all())

@@ -1,10 +1,10 @@
-"""The floor of a task: the smallest error that any sequence of actions is known to leave on the simulated robot.
+"""The oracle error of a task: the error of the best actions found by optimisation on the simulated robot itself.
 
-Found by knowing the robot, in two passes. `greedy` goes through the task once: at every control step Gauss-Newton
-within the bounds of the actuation, with finite differences on a fleet that starts where the robot is, finds the action
-after which the robot is nearest to what is desired next. `improved` then moves all actions of the sequence at once, by
-what each of them does to the configurations of its own period and of the next, which feels a twentieth of it, towards
-the smallest sum of the errors themselves, not of their squares. What is found is an upper bound of the true floor.
+It is an upper bound of the smallest possible error. The optimisation has two passes. `greedy` goes through the task
+once: at every control step a Gauss-Newton search within the bounds of the actuation, with finite differences on a fleet
+in the state of the robot, finds the action after which the robot is nearest to the next desired configuration.
+`improved` then changes all actions of the sequence together, from the derivatives of the configurations in the same
+period and in the next one (about a twentieth), and minimises the sum of the errors, not of their squares.
 """
 
 from __future__ import annotations
@@ -24,23 +24,22 @@ from modsoft.training.simulation.fleet import Fleet, Snapshot
 from modsoft.training.simulation.rollout import configuration_errors_percent, rollout
 
 PROBE = 1e-4  # of actuation, for finite differences
-CLOSE = 1e-5  # of the unit vector: nearer than this, no trial is worth it
-ENOUGH = 1e-3  # of the error: a smaller gain of a step ends the search in a control step
-ENOUGH_OF_ALL = 1e-2  # likewise of a sweep over all actions
+TOLERANCE = 1e-5  # of the unit vector: a smaller error is not improved
+LEAST_GAIN = 1e-3  # of the error: a smaller gain of a step ends the search in a control step
+LEAST_GAIN_OF_SWEEP = 1e-2  # likewise of a sweep over all actions
 TRIALS = 10  # Gauss-Newton steps in a control step
-HORIZON = 2  # periods that an action is felt for
+HORIZON = 2  # periods with an effect of an action
 SWEEPS = 5
 
 
 class OracleResult(NamedTuple):
-    """actions (K, N, A) and the errors (K, N) that they leave, percent of the unit vector, of the configuration at the
-    start of each period, as the paper counts them."""
+    """The best actions, and the errors of the configurations at the start of each period, as the paper counts them."""
 
-    actions: Array
-    errors: Array
+    actions: Array  # (K, N, A)
+    errors: Array  # (K, N), percent of the unit vector
 
 
-class _Found(NamedTuple):
+class _Candidate(NamedTuple):
     error: float  # summed over the modules, of the unit vector
     action: Array  # (N * A,)
     robot: Snapshot  # after it
@@ -49,7 +48,7 @@ class _Found(NamedTuple):
 def oracle_error(kind: str, modules: int, desired: Array, *, seed: int = 0) -> OracleResult:
     """The best actions found for `desired` (K, N, 3), the configurations at the start of each period, from rest.
 
-    seed: of the guesses that Gauss-Newton's first one competes with. `ModsoftError` if no action keeps the robot whole.
+    seed: of the random starts of Gauss-Newton. Raises `ModsoftError` where the robot diverges under every action.
     """
     actions = improved(kind, modules, desired, greedy(kind, modules, desired, seed=seed))
     reached = rollout(Fleet(kind, modules, 1), actions[:, None]).configuration[:, 0]
@@ -57,26 +56,26 @@ def oracle_error(kind: str, modules: int, desired: Array, *, seed: int = 0) -> O
 
 
 def greedy(kind: str, modules: int, desired: Array, *, seed: int = 0) -> Array:
-    """Actions (K, N, A), each the best for the end of its own period, whatever it means for later ones."""
+    """Actions (K, N, A), each the best for the end of its own period, without regard to later ones."""
     lanes, size = Fleet(kind, modules, 1).lanes, modules * len(KINDS[kind].action)
-    # The robot, one for each finite difference, and some more: a part of a block costs as much as a whole one.
+    # The robot, one for each finite difference, and random starts to fill the last block, which take no extra time.
     robots = Fleet(kind, modules, -(-(size + 3) // lanes) * lanes)
     random = np.random.default_rng(seed)
     robot, guess = robots.snapshot([0]), np.zeros(size)
     actions: list[Array] = []
     for target in next_reference(desired):
-        found = _nearest(robots, robot, target, guess, random)
-        before = actions[-1] if actions else found.action
-        robot, guess = found.robot, np.clip(2.0 * found.action - before, -1.0, 1.0)
-        actions.append(found.action)
+        candidate = _nearest(robots, robot, target, guess, random)
+        before = actions[-1] if actions else candidate.action
+        robot, guess = candidate.robot, np.clip(2.0 * candidate.action - before, -1.0, 1.0)
+        actions.append(candidate.action)
     return np.stack(actions).reshape(len(desired), modules, -1)
 
 
-def _nearest(robots: Fleet, robot: Snapshot, target: Array, guess: Array, random: np.random.Generator) -> _Found:
-    """The action after which a robot is nearest to `target` (N, 3)."""
+def _nearest(robots: Fleet, robot: Snapshot, target: Array, guess: Array, random: np.random.Generator) -> _Candidate:
+    """The action after which a robot in the state `robot` is nearest to `target` (N, 3)."""
     size, spare = len(guess), robots.count - len(guess) - 1
     base, others = guess, np.clip(guess + 0.2 * random.standard_normal((spare, size)), -1.0, 1.0)
-    best = _Found(np.inf, guess, robot)
+    best = _Candidate(np.inf, guess, robot)
     for _ in range(TRIALS):
         probe = np.where(base > 0.0, -PROBE, PROBE)  # never out of bounds
         trials = np.concatenate([base[None], base + np.diag(probe), others])
@@ -91,35 +90,35 @@ def _nearest(robots: Fleet, robot: Snapshot, target: Array, guess: Array, random
             raise ModsoftError("every action tried makes the simulated robot diverge; expected a task within its reach")
         gain, stepped = best.error - error[chosen], not np.array_equal(base, best.action)
         if gain > 0.0:
-            best = _Found(float(error[chosen]), trials[chosen], robots.snapshot([chosen]))
-        if best.error < CLOSE or (stepped and gain <= ENOUGH * best.error):
+            best = _Candidate(float(error[chosen]), trials[chosen], robots.snapshot([chosen]))
+        if best.error < TOLERANCE or (stepped and gain <= LEAST_GAIN * best.error):
             return best
-        if chosen > 0:  # a shorter step was better: its differences first
+        if chosen > 0:  # a shorter step was better: the next differences are around it
             base, others = best.action, np.repeat(best.action[None], spare, axis=0)
             continue
         slopes = ((off[1 : size + 1] - off[0]) / probe[:, None]).T
         roots = np.sqrt(_weights(each[0]))
         bounds = (-1.0 - base, 1.0 - base)
         step = lsq_linear(roots[:, None] * slopes, -roots * off[0], bounds=bounds, method="bvls").x
-        shares = 0.5 ** np.arange(spare + 1)
-        steps = np.clip(base + shares[:, None] * step, -1.0, 1.0)
+        fractions = 0.5 ** np.arange(spare + 1)
+        steps = np.clip(base + fractions[:, None] * step, -1.0, 1.0)
         base, others = steps[0], steps[1:]
     return best
 
 
 def _weights(errors: Array) -> Array:
-    """Of every component (..., 3) in one row: with them the sum of the squares is that of the errors (...) themselves,
-    where these are above 0.001."""
+    """Weights of all components (..., 3), in one row, with which the sum of the squares equals the sum of the errors
+    (...) where these are above 0.001."""
     return np.repeat(1.0 / np.maximum(errors.ravel(), 1e-3), 3)
 
 
 def improved(kind: str, modules: int, desired: Array, actions: Array, *, sweeps: int = SWEEPS) -> Array:
-    """`actions` (K, N, A) moved towards the smallest sum of all errors, for as long as that gains anything."""
+    """`actions` (K, N, A) after at most `sweeps` steps towards the smallest sum of all errors."""
     targets = next_reference(desired)
     robots = Fleet(kind, modules, Fleet(kind, modules, 1).lanes)
     error, taken, configuration = _traced(kind, modules, actions, targets)
     for _ in range(sweeps):
-        if error < CLOSE * desired[..., 0].size:
+        if error < TOLERANCE * desired[..., 0].size:
             break
         slopes = _slopes(kind, modules, actions, taken, configuration)
         off = configuration - targets
@@ -128,13 +127,13 @@ def improved(kind: str, modules: int, desired: Array, actions: Array, *, sweeps:
         weighted = slopes.T @ sparse.diags_array(weights)
         flat = actions.ravel()
         step = _bounded_minimum(weighted @ slopes, weighted @ off.ravel(), -1.0 - flat, 1.0 - flat)
-        shares = 0.5 ** np.arange(robots.count)[:, None, None]
-        trials = np.clip(actions[:, None] + shares * step.reshape(actions[:, None].shape), -1.0, 1.0)
+        fractions = 0.5 ** np.arange(robots.count)[:, None, None]
+        trials = np.clip(actions[:, None] + fractions * step.reshape(actions[:, None].shape), -1.0, 1.0)
         robots.reset()
         reached = rollout(robots, trials).configuration[1:]
         sums = np.linalg.norm(reached - targets[:, None], axis=-1)[:-1].sum(axis=(0, 2))
         best = int(np.nanargmin(sums))
-        if not sums[best] < (1.0 - ENOUGH_OF_ALL) * error:
+        if not sums[best] < (1.0 - LEAST_GAIN_OF_SWEEP) * error:
             break
         actions = trials[:, best]
         error, taken, configuration = _traced(kind, modules, actions, targets)
@@ -142,8 +141,8 @@ def improved(kind: str, modules: int, desired: Array, actions: Array, *, sweeps:
 
 
 def _traced(kind: str, modules: int, actions: Array, targets: Array) -> tuple[float, Snapshot, Array]:
-    """Sum of the errors that count; the robot before each action, K robots in one snapshot; configurations (K, N, 3)
-    after each."""
+    """Sum of the errors at the starts of the periods; the states before each action, as a snapshot of K robots; the
+    configurations (K, N, 3) after each action."""
     robot = Fleet(kind, modules, 1)
     taken, configuration = [], []
     for action in actions:
@@ -184,8 +183,8 @@ def _slopes(kind: str, modules: int, actions: Array, taken: Snapshot, configurat
 
 
 def _bounded_minimum(curvature: sparse.csr_array, gradient: Array, lower: Array, upper: Array) -> Array:
-    """x between the bounds that makes x' curvature x / 2 + gradient' x small: projected Newton steps, each on the
-    variables that no bound holds (Bertsekas, SIAM J. Control Optim. 20, 1982)."""
+    """The minimum x of x' curvature x / 2 + gradient' x between the bounds, by projected Newton steps on the variables
+    that are not at a bound (Bertsekas, SIAM J. Control Optim. 20, 1982)."""
     matrix = sparse.csr_array(curvature + 1e-6 * sparse.eye_array(len(gradient)))
 
     def value(x: Array) -> float:
@@ -199,7 +198,7 @@ def _bounded_minimum(curvature: sparse.csr_array, gradient: Array, lower: Array,
             break
         newton = np.zeros_like(x)
         newton[free] = spsolve(matrix[free][:, free].tocsc(), -slope[free])
-        trials = [np.clip(x + share * newton, lower, upper) for share in 0.5 ** np.arange(12)]
+        trials = [np.clip(x + fraction * newton, lower, upper) for fraction in 0.5 ** np.arange(12)]
         best = min(trials, key=value)
         if not value(best) < value(x):
             break

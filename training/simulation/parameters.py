@@ -1,7 +1,8 @@
-"""Physical parameters of the two robots, as data: what `loads.py` and `arm.py` turn into a simulated robot.
+"""Physical parameters of the two kinds of simulated robots.
 
-One set serves robots of any number of modules: the modules of a robot are alike. Quantities are of one module or of
-the rod's cross-section; the arm is one straight rod along +z, clamped at the origin, first director along +x.
+All modules of a robot have the same parameters, so that they hold for any number of modules. Quantities are those of
+one module or of the rod's cross-section; the arm is one straight rod along +z, clamped at the origin, first director
+along +x.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.robot import Valve
 
 PASCAL_PER_BAR = 1e5
-# Chamber pressures at activation 0 and 1: what a robot file means that does not say otherwise.
+# Chamber pressures at activation 0 and 1: the defaults of the robot file.
 P_MIN_BAR, P_MAX_BAR = (each.default for each in fields(Valve) if each.name in ("p_min_bar", "p_max_bar"))
 
 
@@ -34,7 +35,7 @@ NOMINAL = Perturbation()
 
 @dataclass(frozen=True)
 class Actuators:
-    """Straight actuators along every module, the same in all of them, in the order of the activations (eq. 3).
+    """Straight actuators along every module, in the order of the activations (eq. 3).
 
     At activation u an actuator carries the stress (1 - u) `rest_stress_pa` + u `full_stress_pa` (positive pulls,
     a cable; negative pushes, a chamber), and the force along its own tangent is stress * w(x) * area, with x its local
@@ -115,18 +116,18 @@ class PlantParameters:
         return 0.5 * (of_element[1:] + of_element[:-1])
 
     def settling_slices_s(self) -> list[float]:
-        """How an arm is brought to hang still: simulated for these times, with all motion taken away after each.
+        """Durations of simulation, with all velocities set to zero after each, after which the arm hangs still.
 
-        The damping acts on an element's mean velocity, so that neighbours swinging against each other would swing on
-        for minutes. The times are uneven (golden section), so that no frequency is spared, and begin short, so that the
-        fall from the straight rod does not overshoot.
+        The damping acts on an element's mean velocity, so that opposite oscillations of neighbours would last for
+        minutes. The times are uneven (golden section), so that every frequency is damped, and increase from short ones,
+        so that the fall from the straight rod does not overshoot.
         """
         slices = [0.1 * min(1.0, (k + 1) / 20) * (0.5 + 0.6180339887 * k % 1.0) for k in range(self.settling_slices)]
         return [round(each / self.time_step_s) * self.time_step_s for each in slices]
 
 
-# The robot of the paper's simulations, to the digit (section 2; stated by the authors' published runs). The drag is
-# water's. The explicit rotational damping is only just stable: full-range jumps of long robots can diverge.
+# The robot of the paper's simulations, exactly (section 2; from the authors' published runs). The drag is that of
+# water. The explicit rotational damping is only just stable: full-range jumps of long robots can diverge.
 CABLE = PlantParameters(
     module_length_m=0.05,
     elements=25,
@@ -153,7 +154,7 @@ CABLE = PlantParameters(
 # A robot like that of section 3.1: two opposite chambers a module between stiff connectors, hanging from a stick. The
 # paper gives pressures and reach, not the modules; these are chosen so that three modules reach 6, 36 and over 90
 # degrees, base first, and the tasks stay within the pressures. Density and modulus are those of a hollow section of
-# soft silicone; the connectors' inertia is spread over the module. Linear damping stands for the losses in the wall.
+# soft silicone; the connectors' inertia is spread over the module. Linear damping represents the losses in the wall.
 PNEUMATIC = PlantParameters(
     module_length_m=0.054,
     elements=6,
@@ -187,4 +188,4 @@ PNEUMATIC = PlantParameters(
     settling_slices=60,
 )
 
-PLANTS = {"cable": CABLE, "pneumatic": PNEUMATIC}
+PARAMETERS = {"cable": CABLE, "pneumatic": PNEUMATIC}

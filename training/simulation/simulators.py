@@ -1,4 +1,4 @@
-"""The simulated robots that data can be collected from, each behind one function: actions in, configurations out."""
+"""The simulators for data collection, each behind one function: actions in, configurations out."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from modsoft.runtime.errors import RobotFileError, UsageError
 from modsoft.runtime.robot import Robot
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.fleet import Arms, Fleet
-from modsoft.training.simulation.parameters import NOMINAL, PASCAL_PER_BAR, PLANTS, Perturbation
+from modsoft.training.simulation.parameters import NOMINAL, PARAMETERS, PASCAL_PER_BAR, Perturbation
 from modsoft.training.simulation.rollout import rollout
 
 
 class Simulate(Protocol):
     """Robot and actions (B, K, N, A) of episodes from rest -> configurations (B, K + 1, N, 3), not finite where a robot
-    was lost; what one episode gives does not depend on the others beside it."""
+    diverged. An episode does not depend on the others."""
 
     def __call__(self, robot: Robot, actions: Array, *, perturbation: Perturbation = NOMINAL) -> Array: ...
 
@@ -26,9 +26,9 @@ class Simulate(Protocol):
 class Simulator(NamedTuple):
     """A simulator that data can be collected from."""
 
-    name: str  # goes into the data set: two plants round differently
+    name: str  # stored in the data set: two simulators round differently
     simulate: Simulate
-    batch_size: int  # episodes that it likes to simulate at a time
+    batch_size: int  # episodes at a time for the best speed
 
 
 def fastest(robot: Robot) -> Simulator:
@@ -37,19 +37,19 @@ def fastest(robot: Robot) -> Simulator:
 
 
 def names() -> list[str]:
-    """Of the plants that run here, the fastest first. The fleet's variants round differently from each other, so that
-    a name stands for one result wherever it runs."""
+    """The simulators that run here, the fastest first. Each variant of the fleet has its own name, because they round
+    differently."""
     return [*(f"fleet-{variant}" for variant in reversed(fleet_kernel.variants())), "elastica"]
 
 
 def by_name(name: str, robot: Robot) -> Simulator:
-    """The plant of that name; `UsageError` where it does not run here, `RobotFileError` if it cannot be this robot."""
+    """The simulator of that name; `UsageError` where it does not run here, `RobotFileError` for an unsuitable robot."""
     if name not in names():
         raise UsageError(f"the simulator {name} does not run here; expected {', '.join(names())}")
     _check(robot)
     if name == "elastica":
         return Simulator(name, by_elastica, batch_size=1)
-    # As many as the kernel's lanes: fewer cost the same.
+    # The lanes of the kernel: fewer episodes take the same time.
     return Simulator(name, functools.partial(by_fleet, variant=name.removeprefix("fleet-")), batch_size=8)
 
 
@@ -72,20 +72,20 @@ def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:
 
 
 def _check(robot: Robot) -> None:
-    """What the robot file says and the simulated robot cannot do."""
-    plant, period_s = PLANTS[robot.kind], robot.loop.period_s
-    steps = period_s / plant.time_step_s
+    """Refuses a control period or pressures that the simulated robot does not support."""
+    parameters, period_s = PARAMETERS[robot.kind], robot.loop.period_s
+    steps = period_s / parameters.time_step_s
     if abs(steps - round(steps)) > 1e-6 * steps:
         raise RobotFileError(
-            f"loop.hz {robot.loop.hz} is a period of {period_s:.6g} s; expected whole steps of {plant.time_step_s} s "
-            "for the simulated robot"
+            f"loop.hz {robot.loop.hz} is a period of {period_s:.6g} s; expected whole steps of "
+            f"{parameters.time_step_s} s for the simulated robot"
         )
     if robot.valve is not None:
-        stresses = (plant.actuators.rest_stress_pa, plant.actuators.full_stress_pa)
+        stresses = (parameters.actuators.rest_stress_pa, parameters.actuators.full_stress_pa)
         expected = [round(-stress / PASCAL_PER_BAR, 6) for stress in stresses]
-        found = [robot.valve.p_min_bar, robot.valve.p_max_bar]
-        if found != expected:
+        in_file = [robot.valve.p_min_bar, robot.valve.p_max_bar]
+        if in_file != expected:
             raise RobotFileError(
-                f"valve.p_min_bar, p_max_bar are {found[0]}, {found[1]}; the simulated robot knows {expected[0]}, "
-                f"{expected[1]} only"
+                f"valve.p_min_bar, p_max_bar are {in_file[0]}, {in_file[1]}; expected {expected[0]}, {expected[1]}, "
+                "the pressures of the simulated robot"
             )
