@@ -1,13 +1,13 @@
 """`make soak`: an hour of the rig, with a fault of the failure matrix about once a minute.
 
-The unmodified modsoft-runtime drives the emulated board, the fake tracker and the simulated robot at 2.5 Hz. In the
-first third come only faults that a run has to outlast, so that one process is watched for long; then any. Where a fault
-ended the run, as it must, the next one is started on the same board. At the end: whether every fault was noticed and
-named, whether any valve ever had a wrong value, whether memory grew, whether the log can be read. Faults and times are
-drawn with `--seed`. Then, with `--proofs`, the failure matrix with its full numbers (tools/reliability.py --full), 10^8
-corrupted frames and 10^6 on the emulated board among them: hours.
+The unmodified modsoft-runtime drives the emulated board, the fake tracker and the simulated robot at 2.5 Hz. The first
+third injects transient faults only, so that one process runs for long; then all faults. Where a fault ends a run, the
+next run starts on the same board. The report states whether every fault was detected and named, whether any valve had a
+wrong value, whether memory grew, and whether the log is complete. `--seed` sets the order and the times of the faults.
+With `--proofs`, the failure matrix with its full numbers (tools/reliability.py --full) follows, with 10^8 corrupted
+frames, 10^6 of them on the emulated board: hours.
 
-Exit code 1 where anything was not as it must be.
+Exit code 1 if a check failed.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ import click
 
 from modsoft.hil import shipped
 from modsoft.hil.board.emulator import build, choose
-from modsoft.hil.post_fault_checks import Injected, Ran
-from modsoft.hil.record import board_in_words, firmware_sha256
+from modsoft.hil.post_fault_checks import InjectedFault, SoakRun
+from modsoft.hil.record import board_description, firmware_sha256
 from modsoft.hil.soak import Soak, SoakRig
 from modsoft.runtime import log
 from modsoft.runtime.control.model import Model
@@ -36,12 +36,12 @@ from modsoft.runtime.files import written
 
 ROOT = Path(__file__).resolve().parents[1]
 ROBOT, TASK = "pneumatic-3", "down"
-GROWTH_MIB_PER_H = 4.0  # every tick leaves its figures for the summary: 0.2 kB of it, 9,000 an hour
+GROWTH_MIB_PER_H = 4.0  # every tick adds its figures to the summary: 0.2 kB, 9,000 an hour
 PROOFS = ["tools/reliability.py", "--full"]
 
 
 def growth_mib_per_h(samples: list[tuple[float, float]]) -> float | None:
-    """Resident memory over time, from the second minute on: Theil and Sen's slope. None for less than five minutes."""
+    """Slope of the resident memory after the first minute (Theil and Sen); None for less than five minutes."""
     kept = [(at_s, mib) for at_s, mib in samples if at_s >= 60.0 and math.isfinite(mib)]
     if not kept or kept[-1][0] - kept[0][0] < 240.0:
         return None
@@ -50,83 +50,84 @@ def growth_mib_per_h(samples: list[tuple[float, float]]) -> float | None:
     return 3600.0 * statistics.median(slopes)
 
 
-def fault_rows(faults: list[Injected]) -> list[str]:
-    """One line for each kind of fault."""
-    kinds: dict[str, list[Injected]] = defaultdict(list)
+def fault_rows(faults: list[InjectedFault]) -> list[str]:
+    """Table with a row for each kind of fault."""
+    kinds: dict[str, list[InjectedFault]] = defaultdict(list)
     for each in faults:
         kinds[each.fault.name].append(each)
-    rows = ["| row | fault | times | noticed | worst | exit codes | words | as it must be |"]
+    rows = ["| row | fault | times | detected | worst | exit codes | message | checks passed |"]
     rows += ["| ---: | --- | ---: | --- | ---: | --- | --- | --- |"]
-    for name, found in sorted(kinds.items(), key=lambda kind: (kind[1][0].fault.row, kind[0])):
-        in_log = [each.noticed_ms for each in found if each.noticed_ms is not None]
-        alone = [each.vented_ms for each in found if each.vented_ms is not None]
-        ended = [each for each in found if each.code is not None]
-        noticed = [f"{len(in_log)} in the log"] * bool(in_log) + [f"{len(ended)} by its end"] * bool(ended)
+    for name, group in sorted(kinds.items(), key=lambda kind: (kind[1][0].fault.row, kind[0])):
+        in_log = [each.detected_ms for each in group if each.detected_ms is not None]
+        alone = [each.vented_ms for each in group if each.vented_ms is not None]
+        ended = [each for each in group if each.code is not None]
+        detected = [f"{len(in_log)} in the log"] * bool(in_log) + [f"{len(ended)} by its end"] * bool(ended)
         worst = f"valves at 0 after {max(alone):.0f} ms" if alone else f"{max(in_log):.0f} ms" if in_log else ""
-        codes = ", ".join(sorted({str(each.code) for each in ended})) or "went on"
-        words = next((each.words.removeprefix("modsoft-runtime: ")[:90] for each in ended), "")
-        wrong = sorted({word for each in found for word in each.wrong})
-        verdict = "**no**: " + "; ".join(wrong) if wrong else "yes"
-        cells = [str(found[0].fault.row), name, str(len(found)), ", ".join(noticed), worst, codes, words, verdict]
+        codes = ", ".join(sorted({str(each.code) for each in ended})) or "continued"
+        message = next((each.message.removeprefix("modsoft-runtime: ")[:90] for each in ended), "")
+        failures = sorted({failure for each in group for failure in each.failures})
+        passed = "**no**: " + "; ".join(failures) if failures else "yes"
+        cells = [str(group[0].fault.row), name, str(len(group)), ", ".join(detected), worst, codes, message, passed]
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return rows
 
 
 def page(soak: Soak, about: dict[str, str]) -> tuple[str, bool]:
-    """The report, and whether everything was as it must be."""
+    """The report, and whether every check passed."""
     runs, faults = soak.runs, soak.faults
-    longest = max(runs, key=lambda ran: ran.ticks)
+    longest = max(runs, key=lambda run: run.ticks)
     growth = growth_mib_per_h(longest.memory_mib)
-    wrong_runs = [f"run {ran.number}: {word}" for ran in runs for word in ran.wrong]
-    wrong_faults = [each for each in faults if each.wrong]
+    failed_runs = [f"run {run.number}: {failure}" for run in runs for failure in run.failures]
+    failed_faults = [each for each in faults if each.failures]
     grew = growth is not None and growth > GROWTH_MIB_PER_H
-    vents = [ran.vented_ms for ran in runs if ran.vented_ms is not None and ran.code != LostInRun.exit_code]
-    stalled_s, seconds = 1e-3 * sum(ran.stalled_ms for ran in runs), sum(ran.seconds for ran in runs)
-    lines = ["# The soak", ""]
+    vents = [run.vented_ms for run in runs if run.vented_ms is not None and run.code != LostInRun.exit_code]
+    stalled_s, seconds = 1e-3 * sum(run.stalled_ms for run in runs), sum(run.seconds for run in runs)
+    lines = ["# Soak test", ""]
     lines += [f"- {name}: {value}" for name, value in about.items()]
     lines += [
         "",
-        f"{sum(ran.ticks for ran in runs)} control ticks in {len(runs)} runs, {len(faults)} faults of "
+        f"{sum(run.ticks for run in runs)} control ticks in {len(runs)} runs, {len(faults)} faults of "
         f"{len({each.fault.name for each in faults})} kinds.",
         "",
     ]
     lines += [
-        f"- Every fault noticed and named: {'yes' if not wrong_faults else f'**no**, {len(wrong_faults)} not'}.",
-        f"- Valve outputs, by the timer registers, against the set-points of the log at all times: at most "
-        f"{max(ran.over_counts for ran in runs):.1f} counts of 4096 above, {max(ran.under_counts for ran in runs):.1f} "
-        f"below, {max(ran.off_counts for ran in runs):.1f} off once settled (1 is rounding).",
-        f"- Every valve at 0 at most {max(vents, default=math.nan):.0f} ms of the board's clock after the runtime "
-        f"began to vent, where it still had the board.",
-        f"- The emulated board stood still for {stalled_s:.1f} s of {seconds / 60:.0f} minutes, while the machine was "
-        "busy with other things.",
-        f"- Every run and its log as it must be: {'yes' if not wrong_runs else '**no**'}.",
-        *(f"    - {word}" for word in wrong_runs),
+        f"- Every fault detected and named: {'yes' if not failed_faults else f'**no**, {len(failed_faults)} not'}.",
+        f"- Valve outputs (timer registers) against the set-points of the log, at all times: at most "
+        f"{max(run.above_counts for run in runs):.1f} counts of 4096 above, "
+        f"{max(run.below_counts for run in runs):.1f} below, "
+        f"{max(run.off_counts for run in runs):.1f} off once settled (1 is rounding).",
+        f"- Every valve at 0 within {max(vents, default=math.nan):.0f} ms (board's clock) of the start of venting, in "
+        "runs that had not lost the board.",
+        f"- The emulated board stalled for {stalled_s:.1f} s of {seconds / 60:.0f} minutes, through other load of the "
+        "machine.",
+        f"- Every run passed its checks, with a complete log: {'yes' if not failed_runs else '**no**'}.",
+        *(f"    - {failure}" for failure in failed_runs),
         "- Memory of the longest run: " + memory(longest, growth) + (" **Too much.**" if grew else ""),
-        *(f"- Memory of the {name}, all the time: {_range(mib)}" for name, mib in soak.helpers_mib.items()),
+        *(f"- Memory of the {name}, whole soak: {_range(mib)}" for name, mib in soak.helpers_mib.items()),
         "",
         *fault_rows(faults),
         "",
     ]
-    return "\n".join(lines), not (wrong_faults or wrong_runs or grew)
+    return "\n".join(lines), not (failed_faults or failed_runs or grew)
 
 
-def memory(ran: Ran, growth: float | None) -> str:
-    found = [mib for _, mib in ran.memory_mib if math.isfinite(mib)]
-    if not found:
-        return "not looked at."
-    grown = "too short to say more" if growth is None else f"{growth:+.2f} MiB an hour after its first minute"
-    return f"{ran.ticks} ticks, {found[0]:.1f} MiB at first, {found[-1]:.1f} MiB at last, {grown}."
+def memory(run: SoakRun, growth: float | None) -> str:
+    values = [mib for _, mib in run.memory_mib if math.isfinite(mib)]
+    if not values:
+        return "not measured."
+    grown = "too short for a slope" if growth is None else f"{growth:+.2f} MiB an hour after its first minute"
+    return f"{run.ticks} ticks, {values[0]:.1f} MiB at first, {values[-1]:.1f} MiB at last, {grown}."
 
 
 def _range(mib: list[float]) -> str:
-    found = [value for value in mib if math.isfinite(value)]
-    return f"{found[0]:.1f} MiB at first, {found[-1]:.1f} at last." if found else "not looked at."
+    values = [value for value in mib if math.isfinite(value)]
+    return f"{values[0]:.1f} MiB at first, {values[-1]:.1f} at last." if values else "not measured."
 
 
 @click.command("soak", help=__doc__, context_settings={"show_default": True})
-@click.option("--minutes", default=60.0, type=click.FloatRange(min=0.1), help="Of the rig.")
+@click.option("--minutes", default=60.0, type=click.FloatRange(min=0.1), help="Duration of the soak.")
 @click.option("--every", "every_s", default=55.0, type=click.FloatRange(min=2.0), help="Seconds between two faults.")
-@click.option("--seed", default=1, help="Of the faults and their times.")
+@click.option("--seed", default=1, help="Of the order and the times of the faults.")
 @click.option(
     "--model",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
@@ -150,12 +151,12 @@ def cli(
     began, load = datetime.now(UTC), os.getloadavg()[1]
     folder = out / f"{began:%Y%m%dT%H%M%SZ}"
     if folder.exists():
-        raise UsageError(f"{folder} exists; start again")
+        raise UsageError(f"{folder} exists already; start the command again")
     folder.mkdir(parents=True)
     click.echo(f"{minutes:g} minutes, everything in {folder}")
     with SoakRig(ROBOT, folder) as rig:
         soak = Soak(rig, model, TASK, folder, minutes, seed, every_s)
-        soak.go(tell)
+        soak.run(print_fault)
         board = rig.board
     host = log.host()
     about = {
@@ -163,9 +164,9 @@ def cli(
         "on": f"{host['system']}, {host['cores']} cores",
         "load average": f"{load:.1f} before, {os.getloadavg()[1]:.1f} at the end"
         f"{'; at real-time priority' if os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR) else ''}",
-        "board": board_in_words(board.board),
+        "board": board_description(board.board),
         "firmware, SHA-256": firmware_sha256(board.board),
-        "robot, task": f"{ROBOT}, {TASK}, again and again",
+        "robot, task": f"{ROBOT}, {TASK}, repeated",
     }
     text, good = page(soak, about)
     for path in [folder / "report.md", *([report] if report else [])]:
@@ -176,10 +177,10 @@ def cli(
     return 0 if good and proved else 1
 
 
-def tell(each: Injected) -> None:
-    """A line on the terminal as it goes."""
-    word = "; ".join(each.wrong) or "ok"
-    click.echo(f"{each.at_s / 60:5.1f} min, run {each.run}: {each.fault.name}: {word}")
+def print_fault(injected: InjectedFault) -> None:
+    """One line on the terminal for each fault."""
+    result = "; ".join(injected.failures) or "ok"
+    click.echo(f"{injected.at_s / 60:5.1f} min, run {injected.run}: {injected.fault.name}: {result}")
     sys.stdout.flush()
 
 

@@ -108,7 +108,7 @@ OUTPUT_FAULTS = {
 
 FAULTS = {
     "exit code of modsoft-runtime": lambda r: {"runtime_exit": 79},
-    "ticks": lambda r: {"asked": np.concatenate([r.asked, r.asked[-1:]])},
+    "ticks": lambda r: {"reference": np.concatenate([r.reference, r.reference[-1:]])},
     "desired configurations: difference from the task's": lambda r: {
         "desired": with_value(r.desired, (70, 1, 0), r.desired[70, 1, 0] + 2e-9)
     },
@@ -126,7 +126,7 @@ FAULTS = {
     },
     "watchdog resets": lambda r: {"board_events": [{"event": "watchdog", "mono_ns": r.mono_ns[0] - 1}]},
     "bytes dropped by the board's receiver": lambda r: {"board_dropped_bytes": 1},
-    "vented, as reported by the board": lambda r: {"said_vented": False},
+    "vented, as reported by the board": lambda r: {"reported_vented": False},
     "highest chamber pressure at the end": lambda r: {"plant_bar": with_value(r.plant_bar, (-1, 2, 1), 0.05)},
     "ticks without time for the valves to settle": lambda r: {
         "acknowledged_ms": with_value(r.acknowledged_ms, 60, 400.0)
@@ -166,9 +166,9 @@ def test_output_before_the_first_set_point_fails(reference):
 
 
 def test_other_task_fails(reference):
-    assessment = assess(replace(reference, asked=-reference.asked))
+    assessment = assess(replace(reference, reference=-reference.reference))
     assert unmet(assessment) == ["desired configurations: difference from the task's"]
-    longer = assess(replace(reference, asked=reference.asked[:-1]))
+    longer = assess(replace(reference, reference=reference.reference[:-1]))
     assert set(unmet(longer)) == {"ticks", "desired configurations: difference from the task's"}
 
 
@@ -234,7 +234,7 @@ def test_short_run_is_inconclusive(reference):
         for name in "tick mono_ns lateness_ms desired configuration frame_mono_ns commanded_bar acknowledged_ms".split()
     }
     record = replace(
-        reference, **short, asked=reference.asked[:50], faults=reference.faults[:50], state=reference.state[:50]
+        reference, **short, reference=reference.reference[:50], faults=reference.faults[:50], state=reference.state[:50]
     )
     valves, end = slewed(reference.start_bar, reference.commanded_bar[:50])
     assessment = assess(replace(record, outputs=valves, end_ns=end, end_us=end * 1e-3))

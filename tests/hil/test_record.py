@@ -54,7 +54,7 @@ def test_a_first_tick_that_sent_nothing_is_a_failed_run_with_a_report(run_folder
     found = run_folder()
     np.testing.assert_array_equal(found.commanded_bar[:, 5:7], [[0.08, 0], [0.2, 0]])
     assert found.missed == 1
-    assert found.runtime_said == "too late"
+    assert found.runtime_message == "too late"
     assessment = criteria.assess(found)
     assert assessment.outcome == "failed"
     report.write(found, assessment, {"board": "native"}, tmp_path)

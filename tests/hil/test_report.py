@@ -22,9 +22,9 @@ def record():
     return Record(
         robot=robots.load("pneumatic-2"),
         task="down",
-        asked=from_angles_deg(angles),
+        reference=from_angles_deg(angles),
         runtime_exit=0,
-        runtime_said="",
+        runtime_message="",
         tick=np.arange(ticks),
         mono_ns=mono,
         lateness_ms=np.linspace(0.1, 1.0, ticks),
@@ -42,7 +42,7 @@ def record():
         state=["RUNNING"] * ticks,
         end_ns=ticks * 400_000_000,
         end_us=ticks * 400_000.0,
-        said_vented=True,
+        reported_vented=True,
         outputs=ValveOutputs(np.array([0]), np.zeros(1), np.zeros((1, 12)), 4096),
         board_events=[],
         board_dropped_bytes=0,
@@ -93,7 +93,9 @@ def test_run_without_a_tick_has_a_report(record, tmp_path):
         name: getattr(record, name)[:0]
         for name in "tick mono_ns lateness_ms desired configuration frame_mono_ns commanded_bar acknowledged_ms".split()
     }
-    failed = replace(record, **empty, faults=record.faults[:0], state=[], runtime_exit=65, runtime_said="model damaged")
+    failed = replace(
+        record, **empty, faults=record.faults[:0], state=[], runtime_exit=65, runtime_message="model damaged"
+    )
     report.write(failed, assess(failed), {}, tmp_path)
     assert "model damaged" in (tmp_path / "report.md").read_text()
     assert "NaN" not in (tmp_path / "report.json").read_text()

@@ -104,7 +104,7 @@ def test_a_killed_runtime_leaves_every_valve_at_0_within_700_ms(strong_model, tm
         for _ in range(3):
             process = rig.run(strong_model, "down")
             wait_until(lambda: rig.ticks() >= 6 or rig.runtime.poll() is not None, 20)
-            assert process.poll() is None, rig.said()
+            assert process.poll() is None, rig.last_message()
             time.sleep(phases.uniform(0.0, 0.4))
             bar = max(rig.board.duties()) * rig.robot.valve.full_scale_bar
             assert bar > 0.34, "less to vent than there can be"

@@ -1,4 +1,4 @@
-"""What a soak says of its faults and runs: right ones pass, everything that is planted is found. And a short one."""
+"""The checks of a soak: valid runs pass, each planted failure is found. And a short soak."""
 
 import importlib.util
 import json
@@ -15,13 +15,13 @@ from reference_run import COUNTS, reference_run, slewed, with_output
 from modsoft.hil import soak as soaks
 from modsoft.hil.faults import FAULTS
 from modsoft.hil.outputs import read_outputs
-from modsoft.hil.post_fault_checks import Injected, Ran, judge_fault, judge_log, judge_valves, judge_vent
+from modsoft.hil.post_fault_checks import InjectedFault, SoakRun, check_fault, check_log, check_valves, check_vent
 from modsoft.runtime.log_reader import Run, read
 from modsoft.runtime.log_record import EndRecord, StartRecord
 
 START = StartRecord(0, np.zeros(12))
 TOOL = Path(__file__).parents[2] / "tools" / "soak.py"
-PASSING = next(fault for fault in FAULTS if fault.name == "tool hidden for a moment")
+TRANSIENT = next(fault for fault in FAULTS if fault.name == "tool hidden briefly")
 ENDING = next(fault for fault in FAULTS if fault.name == "cable pulled")
 
 
@@ -33,12 +33,12 @@ def tool():
     return module
 
 
-def test_faults_are_of_the_matrix_and_say_what_must_follow():
+def test_faults_have_a_row_and_a_required_reaction():
     assert len({fault.name for fault in FAULTS}) == len(FAULTS)
     for fault in FAULTS:
         assert 1 <= fault.row <= 30
-        assert fault.goes_by or fault.codes, f"{fault.name}: nothing follows"
-        assert re.compile(fault.says)
+        assert fault.is_transient or fault.codes, f"{fault.name}: no reaction"
+        assert re.compile(fault.message)
     assert len([fault for fault in FAULTS if not fault.codes]) >= 5, "for the first third"
 
 
@@ -55,32 +55,32 @@ LOST = "modsoft-runtime: board at /dev/ttyACM0 lost: no word from the board for 
 
 
 @pytest.mark.parametrize(
-    ("fault", "noticed_ms", "code", "said", "wrong"),
+    ("fault", "detected_ms", "code", "messages", "failures"),
     [
-        (PASSING, 300.0, None, "", []),
-        (PASSING, None, None, "", ["not noticed"]),
-        (PASSING, 300.0, 79, "modsoft-runtime: tool hidden", ["it ended the run with 79"]),
+        (TRANSIENT, 300.0, None, "", []),
+        (TRANSIENT, None, None, "", ["not detected"]),
+        (TRANSIENT, 300.0, 79, "modsoft-runtime: tool hidden", ["it ended the run with 79"]),
         (ENDING, None, 74, LOST, []),
         (ENDING, None, 70, LOST, ["expected exit code (74,) and 'board.*lost'"]),
         (ENDING, None, 74, "modsoft-runtime: no idea", ["expected exit code (74,) and 'board.*lost'"]),
-        (ENDING, None, None, "", ["the run went on"]),
+        (ENDING, None, None, "", ["the run continued"]),
     ],
 )
-def test_a_fault_has_to_be_noticed_and_named(fault, noticed_ms, code, said, wrong):
-    each = Injected(fault, 1, 0.0, mono_ns=10**9, noticed_ms=noticed_ms)
+def test_fault_has_to_be_detected_and_named(fault, detected_ms, code, messages, failures):
+    injected = InjectedFault(fault, 1, 0.0, mono_ns=10**9, detected_ms=detected_ms)
     board = events((900, 0.1), (1500, 0.0))
-    judge_fault(each, Ran(1, code=code or 0), code is not None, said, board)
-    assert each.wrong == wrong
+    check_fault(injected, SoakRun(1, code=code or 0), code is not None, messages, board)
+    assert injected.failures == failures
 
 
-def test_a_board_that_vents_too_late_or_never_is_found():
-    for last_ms, found in ((1700, []), (1701, ["valves at 0 after 701 ms, allowed 700"])):
-        each = Injected(ENDING, 1, 0.0, mono_ns=10**9)
-        judge_fault(each, Ran(1, code=74), True, LOST, events((900, 0.1), (last_ms, 0.0)))
-        assert each.wrong == found
-    each = Injected(ENDING, 1, 0.0, mono_ns=10**9)
-    judge_fault(each, Ran(1, code=74), True, LOST, events((900, 0.1)))
-    assert each.wrong == ["valves at 0 after inf ms, allowed 700"]
+def test_board_that_vents_too_late_or_never_is_found():
+    for last_ms, failures in ((1700, []), (1701, ["valves at 0 after 701 ms, limit 700"])):
+        injected = InjectedFault(ENDING, 1, 0.0, mono_ns=10**9)
+        check_fault(injected, SoakRun(1, code=74), True, LOST, events((900, 0.1), (last_ms, 0.0)))
+        assert injected.failures == failures
+    injected = InjectedFault(ENDING, 1, 0.0, mono_ns=10**9)
+    check_fault(injected, SoakRun(1, code=74), True, LOST, events((900, 0.1)))
+    assert injected.failures == ["valves at 0 after inf ms, limit 700"]
 
 
 # ---- Valves
@@ -91,10 +91,10 @@ def reference():
     return reference_run()
 
 
-def judged(record, stopped_ns=None):
-    ran = Ran(1)
-    judge_valves(ran, record, stopped_ns)
-    return ran.wrong
+def valve_failures(record, stopped_ns=None):
+    run = SoakRun(1)
+    check_valves(run, record, stopped_ns)
+    return run.failures
 
 
 def with_counts(record, from_ms, until_ms, counts):
@@ -102,55 +102,55 @@ def with_counts(record, from_ms, until_ms, counts):
     return replace(record, outputs=with_output(record, at_ns + from_ms * 10**6, at_ns + until_ms * 10**6, counts))
 
 
-def test_right_valves_pass(reference):
-    assert judged(reference) == []
+def test_valves_of_the_reference_run_pass(reference):
+    assert valve_failures(reference) == []
 
 
-def test_a_valve_above_or_below_what_was_commanded_is_found_at_any_time(reference):
-    assert any("above" in word for word in judged(with_counts(reference, 12, 22, COUNTS // 2)))
-    assert any("below" in word for word in judged(with_counts(reference, 12, 22, 0)))
-    assert any("off" in word for word in judged(with_counts(reference, 300, 310, 0)))
+def test_valve_above_below_or_off_its_set_point_is_found(reference):
+    assert any("above" in failure for failure in valve_failures(with_counts(reference, 12, 22, COUNTS // 2)))
+    assert any("below" in failure for failure in valve_failures(with_counts(reference, 12, 22, 0)))
+    assert any("off" in failure for failure in valve_failures(with_counts(reference, 300, 310, 0)))
 
 
-def test_a_board_that_vents_by_itself_is_never_wrong_but_one_that_opens_is(reference):
+def test_board_that_vents_by_itself_passes_unless_it_opens_a_valve(reference):
     since = int(reference.mono_ns[60])
-    assert judged(with_counts(reference, 12, 350, 0), since) == []
-    assert any("above" in word for word in judged(with_counts(reference, 12, 22, COUNTS // 2), since))
+    assert valve_failures(with_counts(reference, 12, 350, 0), since) == []
+    assert any("above" in failure for failure in valve_failures(with_counts(reference, 12, 22, COUNTS // 2), since))
 
 
-def test_set_points_that_were_not_acknowledged_may_not_have_arrived(reference):
-    """The registers stay for a tick where they were, and the log says otherwise."""
+def test_set_point_without_acknowledgement_may_not_have_arrived(reference):
+    """The outputs keep the set-point before, for a tick."""
     k = 60
     arrived, acknowledged = reference.commanded_bar.copy(), reference.acknowledged_ms.copy()
     arrived[k] = arrived[k - 1]
     stayed = replace(reference, outputs=slewed(reference.start_bar, arrived)[0])
-    assert any("off" in word for word in judged(stayed))
+    assert any("off" in failure for failure in valve_failures(stayed))
     acknowledged[k] = np.nan
-    assert judged(replace(stayed, acknowledged_ms=acknowledged)) == []
+    assert valve_failures(replace(stayed, acknowledged_ms=acknowledged)) == []
 
 
-def test_a_valve_left_open_and_one_opened_too_early_are_found(reference):
+def test_valve_left_open_or_opened_too_early_is_found(reference):
     left = reference.outputs._replace(duty=np.vstack([reference.outputs.duty[:-1], reference.outputs.duty[-2:-1]]))
-    assert "a valve was left open" in judged(replace(reference, outputs=left))
+    assert "a valve was left open" in valve_failures(replace(reference, outputs=left))
     early = with_output(reference, reference.start_ns - 2 * 10**9, reference.start_ns - 10**9, 1)
-    assert "a valve was open before the first set-point" in judged(replace(reference, outputs=early))
+    assert "a valve was open before the first set-point" in valve_failures(replace(reference, outputs=early))
 
 
 @pytest.mark.parametrize(
-    ("code", "zero_ms", "wrong"),
+    ("code", "zero_ms", "fails"),
     [
         (130, 10_200, False),
         (130, 10_300, True),  # the ramp takes 175 ms
-        (74, 10_600, False),  # the board was lost, and told nothing
+        (74, 10_600, False),  # the board was lost and received no command
         (74, 10_701, True),
         (79, None, True),
     ],
 )
-def test_the_vent_takes_as_long_as_the_ramp_or_the_board_alone(reference, code, zero_ms, wrong):
+def test_vent_is_limited_by_the_ramp_or_the_time_out_of_the_board(reference, code, zero_ms, fails):
     board = events((9_900, 0.1), *([] if zero_ms is None else [(zero_ms, 0.0)]))
-    ran = Ran(1, code=code)
-    judge_vent(ran, replace(reference, end_ns=10_000 * 10**6, end_us=1e7, outputs=read_outputs(board)))
-    assert bool(ran.wrong) == wrong
+    run = SoakRun(1, code=code)
+    check_vent(run, replace(reference, end_ns=10_000 * 10**6, end_us=1e7, outputs=read_outputs(board)))
+    assert bool(run.failures) == fails
 
 
 # ---- The log
@@ -162,35 +162,35 @@ def log_of(**changed):
 
 
 @pytest.mark.parametrize(
-    ("read", "said", "wrong"),
+    ("log", "messages", "failures"),
     [
         (log_of(), "board lost", []),
         (log_of(), "", ["the log and the terminal give different reasons"]),
-        (log_of(exit_code=None), "board lost", ["the log says exit code None"]),
+        (log_of(exit_code=None), "board lost", ["exit code of the log: None"]),
         (log_of(lines_lost=2), "board lost", ["2 lines of the log lost"]),
         (log_of()._replace(ticks=[tick_record(2), tick_record(0)]), "board lost", ["ticks of the log out of order"]),
         (log_of()._replace(events=[START]), "board lost", ["the log has no end"]),
     ],
 )
-def test_a_log_is_whole_and_says_what_the_terminal_said(read, said, wrong):
-    ran = Ran(1, code=74)
-    judge_log(ran, read, said)
-    assert ran.wrong == wrong
+def test_log_is_complete_and_agrees_with_the_terminal(log, messages, failures):
+    run = SoakRun(1, code=74)
+    check_log(run, log, messages)
+    assert run.failures == failures
 
 
-# ---- The whole
+# ---- The command
 
 
-def test_memory_that_grows_is_told_an_hour(tool):
+def test_growth_of_memory_is_per_hour(tool):
     samples = [(5.0 * k, 80.0 + 0.001 * k) for k in range(200)]  # a kilobyte every five seconds
     assert tool.growth_mib_per_h(samples) == pytest.approx(0.72)
     assert tool.growth_mib_per_h(samples[:40]) is None
 
 
 @pytest.mark.realtime
-def test_a_short_soak(tool, model_file, tmp_path, monkeypatch):
-    """A fault that goes by, again and again, and one that ends the run: the next one starts on the same board."""
-    chosen = [fault for fault in FAULTS if fault.name in ("tool hidden for a moment", "board reset")]
+def test_short_soak(tool, model_file, tmp_path, monkeypatch):
+    """A transient fault, repeated, and one that ends the run: the next run starts on the same board."""
+    chosen = [fault for fault in FAULTS if fault.name in ("tool hidden briefly", "board reset")]
     monkeypatch.setattr(soaks, "FAULTS", chosen)
     out, report = tmp_path / "out", tmp_path / "soak.md"
     monkeypatch.setattr(

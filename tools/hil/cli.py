@@ -98,7 +98,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": f"modsoft-hil --robot {Path(robot_file).name} --model {model.name} --task {Path(task).name} "
         f"--board {rig.board.board}" + (f" --steps {steps}" if steps else ""),
-        "board": record.board_in_words(rig.board.board),
+        "board": record.board_description(rig.board.board),
         "board's clock": rig.board.clock,
         "firmware, SHA-256": record.firmware_sha256(rig.board.board),
         "model, SHA-256": hashlib.sha256(model.read_bytes()).hexdigest(),
@@ -110,7 +110,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     for line in [*assessment.criteria, *assessment.host_load_checks]:
         click.echo(f"{'ok' if line.met else 'NO':>4}  {line.name}: {line.measured} ({line.limit})")
     if run.runtime_exit:
-        click.echo(f"last line of modsoft-runtime: {run.runtime_said or 'none'}")
+        click.echo(f"last line of modsoft-runtime: {run.runtime_message or 'none'}")
     click.echo(f"{assessment}\n{report / 'report.md'}")
     # a run without a tick has no figures: its exit code is the runtime's
     return run.runtime_exit if run.runtime_exit and not len(run.tick) else assessment.exit_code

@@ -95,7 +95,7 @@ def desired_error(record: Record) -> float:
     """Largest difference of a component of the logged desired configurations from those of the task."""
     if np.any(record.tick >= record.steps):
         return math.inf
-    return _largest(np.abs(record.desired - record.asked[record.tick]))
+    return _largest(np.abs(record.desired - record.reference[record.tick]))
 
 
 def measurement_error_deg(record: Record) -> Array:
@@ -172,7 +172,7 @@ def valve_criteria(record: Record) -> list[Criterion]:
         at_most("largest valve output", highest, allowed + VALVE_COUNTS, " counts"),
         at_most("largest duty before the first set-point", largest_duty_before(record), 0.0),
         at_most("ticks without time for the valves to settle", int(np.isnan(differences).sum()), 0),
-        Criterion("vented, as reported by the board", _yes(record.said_vented), "yes", record.said_vented),
+        Criterion("vented, as reported by the board", _yes(record.reported_vented), "yes", record.reported_vented),
         at_most("all valve outputs at 0, after the vent began", vented_ms, vent_limit_ms(record), " ms"),
     ]
 

@@ -1,7 +1,7 @@
-"""The faults of the failure matrix that can be injected into a run of the rig, and what has to follow each.
+"""The faults of the failure matrix that the rig can inject into a run, and the reaction that each requires.
 
-A fault either goes by, and the run goes on and says in its log what it saw; or it ends the run with an exit code and a
-line that names it, the valves at 0.
+A run survives a transient fault and shows it in its log. Any other fault ends the run with an exit code, a message that
+names the fault, and all valves at 0.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from modsoft.runtime.log_record import TickRecord
 
 Line = dict[str, Any]
 
-MOMENT_S = 0.5  # one or two control periods, never three
-SILENCE_S = 0.85  # of the tracker: two ticks at least, of which the second has no frame that is young enough
-PAUSE_S = 0.1  # with the heartbeat's period far less than the board's link time-out
+TRANSIENT_S = 0.5  # one or two control periods, never three
+SILENCE_S = 0.85  # of the tracker: at least two ticks, the second without a fresh frame
+PAUSE_S = 0.1  # with the heartbeat's period far below the board's link time-out
 GARBAGE_MS = 90
-NOTICED_WITHIN_S = 30.0
+DETECTED_WITHIN_S = 30.0
 
 
 class Board(Protocol):
-    """What is used of `modsoft.hil.board.emulator.EmulatedBoard`."""
+    """The part of `modsoft.hil.board.emulator.EmulatedBoard` that faults use."""
 
     def send(self, command: str) -> None: ...
     def millivolt(self, pressure_bar: float) -> int: ...
 
 
 class Tracker(Protocol):
-    """What is used of the rig's tracker process."""
+    """The part of the rig's tracker process that faults use."""
 
     def send(self, line: Line) -> None: ...
 
 
 @dataclass
-class Scene:
-    """What a fault acts on: a run in its middle. `sensed`: pressures, bar, that the board's sensors of these channels
-    show instead of the robot's own."""
+class RunInProgress:
+    """The run that a fault acts on. sensed: pressures, bar, that the board's sensors of these channels show in place of
+    the robot's."""
 
     board: Board
     tracker: Tracker
@@ -54,7 +54,7 @@ class Scene:
     sensed: dict[int, float] = field(default_factory=dict)
 
     def before_tick(self, seconds: float) -> None:
-        """Waits until so long before the next tick is due."""
+        """Waits until `seconds` before the next tick is due."""
         self.log.new()
         assert self.log.last is not None, "the run has begun"
         due_s = self.log.last.due_ns * 1e-9
@@ -66,94 +66,94 @@ class Scene:
         self.process.send_signal(number)
 
 
-Act = Callable[[Scene], None]
+Action = Callable[[RunInProgress], None]
 
 
 @dataclass(frozen=True)
 class Fault:
-    """row: of the failure matrix. begin, undo: what is done and what ends it, `lasts_s` later (None: as soon as it was
-    noticed, in a line of the log or by the end of the run).
+    """A fault and the reaction that it requires.
 
-    sign(tick, before): whether a tick of the log shows the fault; `before` is the last tick before the fault.
-    None: it must end the run. codes: the exit codes that it may end the run with; none: the run must go on. says: what
-    the run's last words must match then. vents_ms: the board alone has every valve at 0 so long after `begin`, emulated
-    time; None: the runtime vents, judged from when it said so.
+    row: of the failure matrix. begin: starts the fault; undo: ends it after `lasts_s` (None: as soon as it is detected,
+    in the log or by the end of the run). shown_by(tick, before): whether a tick of the log shows the fault; `before` is
+    the last tick before the fault; None: the fault must end the run. codes: allowed exit codes; empty: the run must
+    continue. message: a pattern that the run's messages must match when it ends. vents_ms: limit for the board alone to
+    bring every valve to 0 after `begin`, emulated time; None: the runtime vents.
     """
 
     name: str
     row: int
-    begin: Act
-    undo: Act | None = None
+    begin: Action
+    undo: Action | None = None
     lasts_s: float | None = None
-    sign: Callable[[TickRecord, TickRecord], bool] | None = None
+    shown_by: Callable[[TickRecord, TickRecord], bool] | None = None
     codes: tuple[int, ...] = ()
-    says: str = ""
+    message: str = ""
     vents_ms: float | None = None
 
     @property
-    def goes_by(self) -> bool:
-        return self.sign is not None
+    def is_transient(self) -> bool:
+        return self.shown_by is not None
 
-    def noticed(self, ticks: list[TickRecord], before: TickRecord) -> TickRecord | None:
+    def detected(self, ticks: list[TickRecord], before: TickRecord) -> TickRecord | None:
         """The first tick that shows the fault."""
-        return next((tick for tick in ticks if self.sign is not None and self.sign(tick, before)), None)
+        return next((tick for tick in ticks if self.shown_by is not None and self.shown_by(tick, before)), None)
 
-    def ended_well(self, code: int, words: str) -> bool:
-        """Whether a run that the fault ended said the right thing."""
-        return code in self.codes and re.search(self.says, words) is not None
-
-
-# ---- How faults are done and seen
+    def explains(self, code: int, messages: str) -> bool:
+        """Whether the exit code and the messages of a run are those that the fault requires."""
+        return code in self.codes and re.search(self.message, messages) is not None
 
 
-def board(*commands: str) -> Act:
-    def act(scene: Scene) -> None:
+# ---- Actions, and how the log shows a fault
+
+
+def board(*commands: str) -> Action:
+    def action(run: RunInProgress) -> None:
         for command in commands:
-            scene.board.send(command)
+            run.board.send(command)
 
-    return act
-
-
-def tracker(**fault: Any) -> Act:
-    return lambda scene: scene.tracker.send(fault)
+    return action
 
 
-def sent(number: int) -> Act:
-    return lambda scene: scene.signal(number)
+def tracker(**fault: Any) -> Action:
+    return lambda run: run.tracker.send(fault)
 
 
-def sensor(channel: int, pressure_bar: float | None) -> Act:
-    """The sensor of a channel shows this pressure whatever the chamber has; None: the chamber's again."""
+def send_signal(number: int) -> Action:
+    return lambda run: run.signal(number)
 
-    def act(scene: Scene) -> None:
-        scene.sensed.pop(channel, None)
+
+def sensor(channel: int, pressure_bar: float | None) -> Action:
+    """The sensor of a channel shows this pressure; None: the pressure of the chamber again."""
+
+    def action(run: RunInProgress) -> None:
+        run.sensed.pop(channel, None)
         if pressure_bar is not None:
-            scene.sensed[channel] = pressure_bar  # the rig sends it again and again
-            scene.board.send(f"adc {channel} {scene.board.millivolt(pressure_bar)}")
+            run.sensed[channel] = pressure_bar  # the rig sends it repeatedly
+            run.board.send(f"adc {channel} {run.board.millivolt(pressure_bar)}")
 
-    return act
+    return action
 
 
-def paused(scene: Scene) -> None:
-    """Over the time at which a tick is due."""
-    scene.before_tick(PAUSE_S / 2)
-    scene.signal(signal.SIGSTOP)
+def pause_at_a_tick(run: RunInProgress) -> None:
+    """Stops the runtime while a tick is due."""
+    run.before_tick(PAUSE_S / 2)
+    run.signal(signal.SIGSTOP)
     time.sleep(PAUSE_S)
-    scene.signal(signal.SIGCONT)
+    run.signal(signal.SIGCONT)
 
 
-def garbage_at_a_tick(scene: Scene) -> None:
-    scene.before_tick(GARBAGE_MS / 2e3)
-    scene.board.send(f"flood {GARBAGE_MS}")
+def garbage_at_a_tick(run: RunInProgress) -> None:
+    run.before_tick(GARBAGE_MS / 2e3)
+    run.board.send(f"flood {GARBAGE_MS}")
 
 
-def held(*words: str) -> Callable[[TickRecord, TickRecord], bool]:
-    """A tick without a good frame, for one of these reasons."""
-    return lambda tick, before: tick.frame_status in words
+def held(*statuses: str) -> Callable[[TickRecord, TickRecord], bool]:
+    """A tick without a valid frame, for one of these reasons."""
+    return lambda tick, before: tick.frame_status in statuses
 
 
 def counted(*names: str) -> Callable[[TickRecord, TickRecord], bool]:
-    """One of the link's counts has grown."""
+    """One of the counters of the connection has increased."""
     return lambda tick, before: any(tick.connection[name] > before.connection[name] for name in names)
 
 
@@ -166,31 +166,37 @@ def acknowledged_late(tick: TickRecord, before: TickRecord) -> bool:
     return (tick.acknowledged.ms or math.inf) > LATE_MS
 
 
-ON_ITS_OWN_MS = 700.0  # cable pulled: the link's time-out and the ramp from the highest pressure
+def noise(name: str, row: int, command: str, probability: float, *counters: str) -> Fault:
+    """Noise on the serial line until a counter of the connection shows it; a run may lose the board by it."""
+    begin, undo = board(f"{command} {probability}"), board(f"{command} 0")
+    return Fault(name, row, begin, undo, None, counted(*counters), LOST, "not acknowledged|no word|did not hear")
+
+
+BOARD_ALONE_MS = 700.0  # cable pulled: the link time-out and the ramp from the highest pressure
 SILENT_HOST_MS = 670.0
 RESET_MS = 130.0
 OVER_PRESSURE_MS = 110.0
-DISAGREE_MS = 2300.0  # two seconds, and the ramp
+DISAGREE_MS = 2300.0  # two seconds and the ramp
 LOST = (74,)
 STALE = ("stale", "frozen", "backwards", "delayed", "no frame")
 
 FAULTS = [
-    # ---- that go by
-    Fault("tool hidden for a moment", 18, tracker(hide=[2]), tracker(hide=[]), MOMENT_S, held("tool hidden")),
+    # ---- transient faults
+    Fault("tool hidden briefly", 18, tracker(hide=[2]), tracker(hide=[]), TRANSIENT_S, held("tool hidden")),
     Fault(
-        "tool left out for a moment",
+        "tool left out briefly",
         18,
         tracker(lose=[3]),
         tracker(lose=[]),
-        MOMENT_S,
+        TRANSIENT_S,
         held("tool hidden", "wrong number of tools"),
     ),
     Fault(
-        "tools swapped for a moment",
+        "tools swapped briefly",
         18,
         tracker(swap=[1, 3]),
         tracker(swap=None),
-        MOMENT_S,
+        TRANSIENT_S,
         held("tools too far apart", "jump"),
     ),
     Fault(
@@ -198,76 +204,46 @@ FAULTS = [
         17,
         tracker(jump={"tool": 2, "deg": 170.0}),
         tracker(jump=None),
-        MOMENT_S,
+        TRANSIENT_S,
         held("jump"),
     ),
-    Fault("tracker frozen for a moment", 14, tracker(freeze=True), tracker(freeze=False), SILENCE_S, held(*STALE)),
+    Fault("tracker frozen briefly", 14, tracker(freeze=True), tracker(freeze=False), SILENCE_S, held(*STALE)),
     Fault("tracker's numbers run back", 19, tracker(back=40), tracker(back=0), SILENCE_S, held(*STALE)),
-    Fault("tracker 0.6 s late for a moment", 15, tracker(delay_s=0.6), tracker(delay_s=0.0), SILENCE_S, held(*STALE)),
+    Fault("tracker 0.6 s late briefly", 15, tracker(delay_s=0.6), tracker(delay_s=0.0), SILENCE_S, held(*STALE)),
+    noise("bits flipped towards the board", 1, "corrupt-rx", 0.004, "missed_acks", "refused"),
+    noise("bytes dropped towards the board", 2, "drop-rx", 0.004, "missed_acks", "refused"),
+    noise("bytes inserted towards the board", 2, "insert-rx", 0.004, "missed_acks", "refused"),
+    noise("bits flipped towards the host", 1, "corrupt-tx", 0.002, "bad_frames", "missed_acks"),
+    Fault("garbage before a set-point", 5, garbage_at_a_tick, shown_by=acknowledged_late),
+    Fault("runtime stopped for 100 ms", 26, pause_at_a_tick, shown_by=late),
+    # ---- faults that end the run: the tracker
+    Fault("tool hidden", 18, tracker(hide=[1]), tracker(hide=[]), codes=(79,), message=r"tool hidden \(module 1\)"),
+    Fault("tools swapped", 18, tracker(swap=[1, 3]), tracker(swap=None), codes=(79,), message="too far apart|jump"),
+    Fault("tracker frozen", 14, tracker(freeze=True), tracker(freeze=False), codes=LOST, message="tracker"),
+    Fault("tracker 1 s late", 15, tracker(delay_s=1.0), tracker(delay_s=0.0), codes=LOST, message="tracker"),
+    Fault("tracker unplugged", 13, tracker(unplug=True), tracker(unplug=False), codes=LOST, message="tracker"),
+    Fault("tracker mute", 13, tracker(mute=True), tracker(mute=False), codes=LOST, message="tracker"),
     Fault(
-        "bits flipped towards the board",
-        1,
-        board("corrupt-rx 0.004"),
-        board("corrupt-rx 0"),
-        None,
-        counted("missed_acks", "refused"),
-        LOST,
-        "not acknowledged|no word|did not hear",
+        "tracker's checksums wrong", 13, tracker(corrupt=True), tracker(corrupt=False), codes=LOST, message="tracker"
     ),
-    Fault(
-        "bytes dropped towards the board",
-        2,
-        board("drop-rx 0.004"),
-        board("drop-rx 0"),
-        None,
-        counted("missed_acks", "refused"),
-        LOST,
-        "not acknowledged|no word|did not hear",
-    ),
-    Fault(
-        "bytes inserted towards the board",
-        2,
-        board("insert-rx 0.004"),
-        board("insert-rx 0"),
-        None,
-        counted("missed_acks", "refused"),
-        LOST,
-        "not acknowledged|no word|did not hear",
-    ),
-    Fault(
-        "bits flipped towards the host",
-        1,
-        board("corrupt-tx 0.002"),
-        board("corrupt-tx 0"),
-        None,
-        counted("bad_frames", "missed_acks"),
-        LOST,
-        "not acknowledged|no word|did not hear",
-    ),
-    Fault("garbage before a set-point", 5, garbage_at_a_tick, sign=acknowledged_late),
-    Fault("runtime stopped for 100 ms", 26, paused, sign=late),
-    # ---- that end the run: the tracker
-    Fault("tool hidden", 18, tracker(hide=[1]), tracker(hide=[]), codes=(79,), says=r"tool hidden \(module 1\)"),
-    Fault("tools swapped", 18, tracker(swap=[1, 3]), tracker(swap=None), codes=(79,), says="too far apart|jump"),
-    Fault("tracker frozen", 14, tracker(freeze=True), tracker(freeze=False), codes=LOST, says="tracker"),
-    Fault("tracker 1 s late", 15, tracker(delay_s=1.0), tracker(delay_s=0.0), codes=LOST, says="tracker"),
-    Fault("tracker unplugged", 13, tracker(unplug=True), tracker(unplug=False), codes=LOST, says="tracker"),
-    Fault("tracker mute", 13, tracker(mute=True), tracker(mute=False), codes=LOST, says="tracker"),
-    Fault("tracker's checksums wrong", 13, tracker(corrupt=True), tracker(corrupt=False), codes=LOST, says="tracker"),
     # ---- the board
-    Fault("cable pulled", 6, board("unplug"), board("plug"), codes=LOST, says="board.*lost", vents_ms=ON_ITS_OWN_MS),
-    Fault("board reset", 8, board("reset"), codes=LOST, says="board.*lost", vents_ms=RESET_MS),
-    Fault("board's power gone and back", 8, board("power-cycle"), codes=LOST, says="board.*lost", vents_ms=RESET_MS),
-    Fault("firmware hangs", 28, board("hang"), codes=LOST, says="board.*lost", vents_ms=RESET_MS),
-    Fault("firmware hangs, interrupts off", 28, board("hang cli"), codes=LOST, says="board.*lost", vents_ms=RESET_MS),
-    Fault("garbage at line rate, 3 s", 5, board("flood 3000"), codes=LOST, says="board", vents_ms=ON_ITS_OWN_MS),
+    Fault(
+        "cable pulled", 6, board("unplug"), board("plug"), codes=LOST, message="board.*lost", vents_ms=BOARD_ALONE_MS
+    ),
+    Fault("board reset", 8, board("reset"), codes=LOST, message="board.*lost", vents_ms=RESET_MS),
+    Fault("board's power gone and back", 8, board("power-cycle"), codes=LOST, message="board.*lost", vents_ms=RESET_MS),
+    Fault("firmware hangs", 28, board("hang"), codes=LOST, message="board.*lost", vents_ms=RESET_MS),
+    Fault(
+        "firmware hangs, interrupts off", 28, board("hang cli"), codes=LOST, message="board.*lost", vents_ms=RESET_MS
+    ),
+    Fault("garbage at line rate, 3 s", 5, board("flood 3000"), codes=LOST, message="board", vents_ms=BOARD_ALONE_MS),
     Fault(
         "over-pressure at a sensor",
         29,
         sensor(0, 0.6),
         sensor(0, None),
         codes=(79,),
-        says="OVER_PRESSURE|still ",
+        message="OVER_PRESSURE|still ",
         vents_ms=OVER_PRESSURE_MS,
     ),
     Fault(
@@ -276,22 +252,22 @@ FAULTS = [
         sensor(2, 0.43),
         sensor(2, None),
         codes=(79,),
-        says="vented by itself|still ",
+        message="vented by itself|still ",
         vents_ms=DISAGREE_MS,
     ),
     # ---- the host
-    Fault("Ctrl-C", 12, sent(signal.SIGINT), codes=(130,), says="stopped by SIGINT"),
-    Fault("SIGTERM", 12, sent(signal.SIGTERM), codes=(143,), says="stopped by SIGTERM"),
-    Fault("terminal closed (SIGHUP)", 12, sent(signal.SIGHUP), codes=(129,), says="stopped by SIGHUP"),
-    Fault("SIGKILL", 10, sent(signal.SIGKILL), codes=(-signal.SIGKILL,), vents_ms=SILENT_HOST_MS),
+    Fault("Ctrl-C", 12, send_signal(signal.SIGINT), codes=(130,), message="stopped by SIGINT"),
+    Fault("SIGTERM", 12, send_signal(signal.SIGTERM), codes=(143,), message="stopped by SIGTERM"),
+    Fault("terminal closed (SIGHUP)", 12, send_signal(signal.SIGHUP), codes=(129,), message="stopped by SIGHUP"),
+    Fault("SIGKILL", 10, send_signal(signal.SIGKILL), codes=(-signal.SIGKILL,), vents_ms=SILENT_HOST_MS),
     Fault(
         "runtime stopped for 2.5 s",
         11,
-        sent(signal.SIGSTOP),
-        sent(signal.SIGCONT),
+        send_signal(signal.SIGSTOP),
+        send_signal(signal.SIGCONT),
         2.5,
         codes=(74, 79),
-        says="did not hear|missed|tracker|lost|vented by itself",
+        message="did not hear|missed|tracker|lost|vented by itself",
         vents_ms=SILENT_HOST_MS,
     ),
 ]

@@ -1,4 +1,4 @@
-"""A run's folder to a `Record`: the runtime's log, the timer registers, the simulated robot, each from its own file."""
+"""Reads a run of the rig: the runtime's log, the board's timer registers and the simulated robot, to a `Record`."""
 
 from __future__ import annotations
 
@@ -22,41 +22,41 @@ from modsoft.runtime.robot import Robot
 
 Line = dict[str, Any]
 
-LATE_BOUND_MS = 20.0  # board.c: emulated time never falls further behind, it gives way and says `late`
+LATE_BOUND_MS = 20.0  # board.c: beyond it emulated time is shifted, with an event `late`
 
 
 @dataclass(frozen=True)
 class Record:
-    """A run, as the three sources tell it. K ticks, N modules, M slices of the plant; times are CLOCK_MONOTONIC."""
+    """A run, from its three sources. K ticks, N modules, M slices of the simulated robot; times are CLOCK_MONOTONIC."""
 
     robot: Robot
     task: str
-    asked: Array  # (steps, N, 3) desired configurations of the task, by the rig's own reading of it
+    reference: Array  # (steps, N, 3) desired configurations of the task, read by the rig itself
     runtime_exit: int
-    runtime_said: str  # its last line, for a run that failed
+    runtime_message: str  # last line of its standard error
     tick: NDArray[np.int64]  # (K,)
     mono_ns: NDArray[np.int64]  # (K,) start of the tick
     lateness_ms: Array  # (K,)
     missed: int
     held: int
     desired: Array  # (K, N, 3)
-    configuration: Array  # (K, N, 3), NaN where no frame was good
-    frame_mono_ns: NDArray[np.int64]  # (K,) when the frame used came in
-    start_ns: int | None  # just before the first set-point; None: the runtime never gave one
+    configuration: Array  # (K, N, 3), NaN without a valid frame
+    frame_mono_ns: NDArray[np.int64]  # (K,) arrival of the frame used; -1: none
+    start_ns: int | None  # just before the first set-point; None: no set-point
     start_bar: Array  # (channels,) that set-point, in force until the first tick
     commanded_bar: Array  # (K, channels)
-    slew_bar_per_s: float  # of the board, or the robot file's where that is slower
-    acknowledged_ms: Array  # (K,), NaN where none came
+    slew_bar_per_s: float  # the slower one of the board's and the robot file's
+    acknowledged_ms: Array  # (K,), NaN without acknowledgement
     faults: NDArray[np.int64]  # (K,)
-    state: list[str]  # (K,) the board's
+    state: list[str]  # (K,) of the board
     end_ns: int  # the vent begins: outputs no longer follow the last tick
     end_us: float  # that instant in emulated time; NaN where the run never began
-    said_vented: bool  # the runtime, on the board's word
+    reported_vented: bool  # by the runtime, after the board confirmed it
     outputs: ValveOutputs
-    board_events: list[dict[str, Any]]  # resets and watchdog, all of the emulator's life
-    board_dropped_bytes: float  # by the board's receiver; NaN where it did not say
+    board_events: list[dict[str, Any]]  # resets and watchdog, over the life of the emulator
+    board_dropped_bytes: float  # by the board's receiver; NaN: unknown
     board_late_ms: float  # largest lateness of emulated time in the run
-    board_slipped_percent: float  # of the run, where emulated time gave way
+    board_slipped_percent: float  # of the run: total shift of emulated time
     board_summary: dict[str, Any]
     plant_mono_ns: NDArray[np.int64]  # (M,)
     plant_configuration: Array  # (M, N, 3)
@@ -66,13 +66,14 @@ class Record:
     @property
     def steps(self) -> int:
         """Ticks that the run should have."""
-        return len(self.asked)
+        return len(self.reference)
 
 
-def read(folder: Path, run: Path | None, robot: Robot, task: str, asked: np.ndarray, runtime_exit: int) -> Record:
-    """The record of a run from the rig's `folder` and from the runtime's own, `run` (None: it never made one).
+def read(folder: Path, run: Path | None, robot: Robot, task: str, reference: Array, runtime_exit: int) -> Record:
+    """Reads the record of a run.
 
-    `asked` (steps, N, 3): the desired configurations that the run was to follow.
+    folder: of the rig's traces. run: of the runtime's log; None: the runtime made none. reference (steps, N, 3): the
+    desired configurations of the task.
     """
     events = lines(folder / "board.jsonl")
     plant = lines(folder / "plant.jsonl")
@@ -83,13 +84,13 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, asked: np.ndar
     end_ns = end.mono_ns if end else ticks[-1].mono_ns if ticks else -1
     summary = next((event for event in events if event["event"] == "summary"), {})
     count, modules = len(ticks), robot.modules
-    said = (folder / "runtime.err").read_text(errors="replace").strip().splitlines()
+    messages = (folder / "runtime.err").read_text(errors="replace").strip().splitlines()
     return Record(
         robot=robot,
         task=task,
-        asked=asked,
+        reference=reference,
         runtime_exit=runtime_exit,
-        runtime_said=said[-1] if said else "",
+        runtime_message=messages[-1] if messages else "",
         tick=np.array([tick.tick for tick in ticks], dtype=np.int64),
         mono_ns=np.array([tick.mono_ns for tick in ticks], dtype=np.int64),
         lateness_ms=np.array([tick.late_ms for tick in ticks]),
@@ -109,7 +110,7 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, asked: np.ndar
         state=[tick.board.state if tick.board else "unknown" for tick in ticks],
         end_ns=end_ns,
         end_us=emulated_us(events, end_ns),
-        said_vented=bool(end and end.vented),
+        reported_vented=bool(end and end.vented),
         outputs=read_outputs(events),
         board_events=[event for event in events if event["event"] in ("reset", "watchdog")],
         board_dropped_bytes=summary.get("rx_overrun", math.nan),
@@ -128,7 +129,7 @@ def _number(value: float | None) -> float:
 
 
 def _commanded(ticks: list[TickRecord], start_bar: Array) -> Array:
-    """Set-points (K, channels) in force after each tick: those before it where nothing was sent."""
+    """Set-points (K, channels) in force after each tick; a tick that sent nothing keeps the last ones."""
     rows = [start_bar]
     for tick in ticks:
         rows.append(rows[-1] if tick.commanded_bar is None else tick.commanded_bar)
@@ -136,30 +137,30 @@ def _commanded(ticks: list[TickRecord], start_bar: Array) -> Array:
 
 
 def _slew_bar_per_s(robot: Robot, meta: Line) -> float:
-    """Fastest change of a valve output: the robot file only says what is allowed, the board may be slower."""
+    """Fastest change of a valve output: the robot file has the limit, the board may be slower."""
     board = meta.get("board")
     slew_bar_per_s = robot.limits.slew_bar_per_s
     return min(slew_bar_per_s, to_bar(board["slew"])) if board else slew_bar_per_s
 
 
 def _board_lateness(events: list[Line], summary: Line, start_ns: float, end_ns: int) -> Line:
-    """Lateness of the emulated board in the run, NaN where it gave no summary. It says `late` whenever the bound is
-    passed and emulated time gives way; without that it was within the bound, or within its largest lateness ever."""
+    """Lateness of the emulated board in the run; NaN without its summary. Each shift of emulated time has an event
+    `late`; without one the lateness was within the bound and within the largest lateness of the summary."""
     late = [
         event["late_us"] * 1e-3
         for event in events
         if event["event"] == "late" and start_ns <= event["mono_ns"] <= end_ns
     ]
-    ever_ms = summary.get("max_late_us", math.nan) * 1e-3
+    largest_ms = summary.get("max_late_us", math.nan) * 1e-3
     run_ms = (end_ns - start_ns) * 1e-6
     return {
-        "board_late_ms": max(late) if late else min(LATE_BOUND_MS, ever_ms) if ever_ms >= 0 else math.nan,
+        "board_late_ms": max(late) if late else min(LATE_BOUND_MS, largest_ms) if largest_ms >= 0 else math.nan,
         "board_slipped_percent": 100.0 * sum(late) / run_ms if run_ms > 0 else math.nan,
     }
 
 
 def _plant(states: list[Line], modules: int, start_ns: float, end_ns: int) -> Line:
-    """The plant's columns of a record; its lateness only of the slices in the run."""
+    """The columns of the simulated robot; its lateness is that of the slices in the run."""
     late = [state["late_ms"] for state in states if start_ns <= state["mono_ns"] <= end_ns]
     return {
         "plant_mono_ns": _column(states, "mono_ns", np.int64),
@@ -170,16 +171,13 @@ def _plant(states: list[Line], modules: int, start_ns: float, end_ns: int) -> Li
 
 
 def lines(path: Path) -> list[Line]:
-    """JSON lines. The last one of a process that was killed may be cut short; it is left out."""
+    """Reads JSON lines. A last line without its end, from a process that was killed, is left out."""
     decode = msgspec.json.Decoder(Line).decode
-    found = []
-    for text in path.read_bytes().split(b"\n")[:-1]:
-        found.append(decode(text))
-    return found
+    return [decode(text) for text in path.read_bytes().split(b"\n")[:-1]]
 
 
-def board_in_words(board: str) -> str:
-    """What ran, for the report."""
+def board_description(board: str) -> str:
+    """Description of an emulated board for the report."""
     return {
         "simavr": "compiled firmware on an emulated ATmega2560 behind the MEGA's bootloader (simavr)",
         "native": "firmware logic compiled for this machine (no emulated processor)",
@@ -187,6 +185,6 @@ def board_in_words(board: str) -> str:
 
 
 def firmware_sha256(board: str) -> str:
-    """Of the flashed image; of the sources where the logic is compiled for this machine."""
+    """SHA-256 of the flashed image, or of the sources where the logic is compiled for this machine."""
     files = [FIRMWARE_ELF.with_suffix(".hex")] if board == "simavr" else sorted(FIRMWARE.glob("*.[ch]"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()

@@ -95,7 +95,7 @@ def text(
     lines = [f"# {record.robot.name}, task {record.task}: {assessment}", ""]
     lines += [f"- {name}: {value}" for name, value in about.items()]
     if record.runtime_exit:
-        lines += [f"- last line of modsoft-runtime: {record.runtime_said or 'none'}"]
+        lines += [f"- last line of modsoft-runtime: {record.runtime_message or 'none'}"]
     lines += ["", "| criterion | measured | limit | met |", "| --- | --- | --- | --- |"]
     void = any(not check.met for check in assessment.host_load_checks)
     lines += [_row(line, void) for line in assessment.criteria]

@@ -240,7 +240,7 @@ class Rig:
         self._follower.new()
         return self._follower.count
 
-    def said(self) -> str:
+    def last_message(self) -> str:
         """The runtime's last line on standard error."""
         lines = (self.folder / "runtime.err").read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
