@@ -22,8 +22,8 @@ from modsoft.runtime import log as logs
 from modsoft.runtime import robot as robots
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.board import Board
-from modsoft.runtime.board.dry_run import Rehearsal
-from modsoft.runtime.board.ports import find_port, ports_here
+from modsoft.runtime.board.dry_run import DryRunBoard
+from modsoft.runtime.board.ports import describe_ports, find_port
 from modsoft.runtime.board.protocol import VentMode
 from modsoft.runtime.clock import Ticker, spinning
 from modsoft.runtime.control import correction
@@ -148,7 +148,7 @@ def run(options: Options) -> None:
                     desired,
                     slot,
                     judge,
-                    board or Rehearsal(),
+                    board or DryRunBoard(),
                     Ticker(robot.loop.period_s, time.monotonic, spinning(stop.wait)),
                     stop,
                     log.put,
@@ -229,7 +229,7 @@ def _port(told: str) -> str:
     """The board's port, which is there. It is not opened: that comes last."""
     if not told:
         raise UsageError(
-            f"the board's port is not told; give --port, or port under [serial] in the robot file; {ports_here()}"
+            f"the board's port is not told; give --port, or port under [serial] in the robot file; {describe_ports()}"
         )
     return find_port(told)
 

@@ -30,8 +30,9 @@ from mutate import equivalents
 
 ROOT = Path(__file__).resolve().parent.parent
 EQUIVALENT = Path(__file__).with_name("mutate_runtime_equivalent.txt")
-# The tests of NAME.py are in tests/runtime/test_NAME*.py.
-SOURCES = ("safety.py", "stop.py", "board/connection.py", "control/controller.py", "loop.py")
+# The tests of NAME.py are in tests/runtime/test_NAME*.py; those of discovery with its connection.
+SOURCES = ("safety.py", "stop.py", "board/connection.py", "board/discovery.py", "control/controller.py", "loop.py")
+TESTS = {"board/discovery.py": "connection"}
 HANGS_AFTER_S = 20  # a run of one file's tests takes about 1
 MEMORY = 4 << 30  # bytes; an endless loop fills more
 PLUGINS = ("cacheprovider", "timeout", "faulthandler", "xdist", "threadexception", "unraisableexception", "anyio")
@@ -72,7 +73,7 @@ class FirstFailure:
 
 
 def _run_tests(source: str, plugin: FirstFailure, *options: str) -> int:
-    tests = map(str, sorted((ROOT / "tests" / "runtime").glob(f"test_{Path(source).stem}*.py")))
+    tests = map(str, sorted((ROOT / "tests" / "runtime").glob(f"test_{TESTS.get(source, Path(source).stem)}*.py")))
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         return int(pytest.main([*OPTIONS, *options, *tests], plugins=[plugin]))
 

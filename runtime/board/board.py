@@ -1,4 +1,4 @@
-"""The board at the other end of the serial port: what it says of itself, and calls that wait for its answer."""
+"""The board at the serial port: its state, and calls that wait for its replies."""
 
 from __future__ import annotations
 
@@ -11,15 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from modsoft.runtime.board.configuration_check import check_board
-from modsoft.runtime.board.connection import (
-    HELLO_WAIT_S,
-    RESETS,
-    STATUS_SILENCE_S,
-    Connection,
-    Phase,
-    fault_names,
-    refusal,
-)
+from modsoft.runtime.board.connection import STATUS_SILENCE_S, Connection, Phase
+from modsoft.runtime.board.discovery import HELLO_WAIT_S, RESETS
 from modsoft.runtime.board.io_thread import IoThread
 from modsoft.runtime.board.ports import Port, may_be_mega, open_port
 from modsoft.runtime.board.protocol import (
@@ -34,29 +27,31 @@ from modsoft.runtime.board.protocol import (
     State,
     Status,
     VentMode,
+    fault_names,
+    refusal,
     to_bar,
     to_units,
 )
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, Tripped
 from modsoft.runtime.robot import Robot
 
-ARM_WAIT_S = 4.0  # a second of heartbeats, and the ramp of a vent before
-ARM_AGAIN_S = 0.1
-# What a former host leaves behind that went away, on a board that did not restart since; nothing to mend.
-GONE_HOST = Fault.LINK_TIMEOUT | Fault.CONTROL_TIMEOUT
+ARM_WAIT_S = 4.0  # a second of heartbeats, after the ramp of a vent
+ARM_RETRY_S = 0.1
+# Faults of a board whose previous host disconnected; nothing to repair.
+HOST_DISCONNECTED = Fault.LINK_TIMEOUT | Fault.CONTROL_TIMEOUT
 VENT_WAIT_S = 3.0
-LOST_VENT_WAIT_S = 6.0  # a board in its bootloader needs up to 5 s of silence to come back
+LOST_VENT_WAIT_S = 6.0  # a board in its bootloader restarts after up to 5 s of silence
 CLEAR_WAIT_S = 1.0
-DOWN_WAIT_S = 1.0  # for the air to leave, after the valves are at 0
+DOWN_WAIT_S = 1.0  # for the pressures to decay, after the valves are at 0
 
 
 class Board:
-    """A board that has announced itself and speaks this protocol. Use as a context manager: leaving vents and closes.
+    """A board that has sent HELLO in this version's protocol. As a context manager it vents and closes on exit.
 
-    port: an open serial port. name: for messages. clock: monotonic seconds. threaded: False drives the port from the
-    calls that wait instead of a thread of its own, for tests on virtual time. resettable: False for a device that is
-    known to be no MEGA, and is not to be reset through DTR.
-    Raises `DeviceAbsent` when nothing announces itself, `ProtocolMismatch` when it speaks another protocol.
+    port: an open serial port. name: for messages. clock: monotonic seconds. threaded: False serves the port in the
+    calls that wait, instead of in a thread, for tests on virtual time. resettable: False for a device that is known
+    not to be a MEGA and must not be reset through DTR.
+    Raises `DeviceAbsent` without a HELLO, `ProtocolMismatch` for another protocol.
     """
 
     def __init__(
@@ -69,195 +64,195 @@ class Board:
     ) -> None:
         self.name = name
         self._clock = clock
-        self._link = Connection(clock(), resettable)
-        self._line = IoThread(port, self._link, clock, threaded)
+        self._connection = Connection(clock(), resettable)
+        self._io_thread = IoThread(port, self._connection, clock, threaded)
         self._p_max = 0
         self._listened = False
         try:
             self._await_hello()
         except BaseException:
-            self._line.close()
+            self._io_thread.close()
             raise
 
     @classmethod
     def open(cls, name: str, baud: int = 250000) -> Board:
-        """Open the port called `name` for this program alone and wait until the board there has announced itself.
+        """Open the port `name` exclusively and wait for the HELLO of the board.
 
-        Raises `DeviceAbsent`, `PortBusy` and `ProtocolMismatch`, each with what to do.
+        Raises `DeviceAbsent`, `PortBusy` and `ProtocolMismatch`.
         """
         return cls(open_port(name, baud), name, resettable=may_be_mega(name))
 
-    # ---- what is known
+    # ---- state
 
     @property
     def hello(self) -> Hello:
-        """What the board said about itself."""
-        assert self._link.hello is not None
-        return self._link.hello
+        """HELLO of the board: identity and configuration."""
+        assert self._connection.hello is not None
+        return self._connection.hello
 
     @property
     def status(self) -> Status | None:
-        """The board's last word; None before the first."""
-        return self._link.status
+        """The last STATUS; None before the first."""
+        return self._connection.status
 
     @property
     def status_age_s(self) -> float:
-        """Seconds since that word."""
-        return self._clock() - self._link.status_at
+        """Seconds since the last STATUS."""
+        return self._clock() - self._connection.status_at
 
     @property
     def applied_bar(self) -> np.ndarray:
-        """(channels,) what the valves are told, bar; NaN before the first STATUS."""
+        """Set-points (channels,) of the valves, bar; NaN before the first STATUS."""
         return self._bar("applied")
 
     @property
     def measured_bar(self) -> np.ndarray:
-        """(channels,) what the sensors read, bar; NaN where there is none."""
+        """Measured pressures (channels,), bar; NaN for channels without a sensor."""
         return self._bar("measured")
 
     def _bar(self, field: str) -> np.ndarray:
-        status = self._link.status
+        status = self._connection.status
         if status is None:
             return np.full(CHANNELS, np.nan)
         return np.array([math.nan if units == NOT_MEASURED else to_bar(units) for units in getattr(status, field)])
 
     @property
     def ack_latency_s(self) -> float | None:
-        """Seconds from the writing of the last set-points to their acknowledgement; None before that."""
-        return self._link.ack_latency_s
+        """Seconds from sending the last set-points to their acknowledgement; None before it."""
+        return self._connection.ack_latency_s
 
     @property
     def lost(self) -> str | None:
-        """Why the board is lost, or None."""
-        return self._link.lost
+        """Reason why the board is lost, or None."""
+        return self._connection.lost
 
     @property
     def statistics(self) -> dict[str, int]:
-        """Counts since the opening: bytes, bad_frames, refused, sets, missed_acks."""
-        with self._line.changed:
-            return dict(self._link.counts)
+        """Counts since opening: bytes, bad_frames, refused, sets, missed_acks."""
+        with self._io_thread.changed:
+            return dict(self._connection.counts)
 
     def check(self) -> None:
-        """Raise `LostInRun` when either side lost the other, `Tripped` when the board latched another fault."""
-        if self._link.lost is not None:
+        """Raise `LostInRun` if the connection is lost on either side, `Tripped` if the board latched a fault."""
+        if self._connection.lost is not None:
             raise LostInRun(
-                f"board at {self.name} lost: {self._link.lost}; it vents by itself, check the cable and restart"
+                f"board at {self.name} lost: {self._connection.lost}; it vents by itself, check the cable and restart"
             )
-        status = self._link.status
+        status = self._connection.status
         if status is not None and status.faults == Fault.LINK_TIMEOUT:
-            raise LostInRun(f"the board at {self.name} did not hear from us in time and vented by itself; start again")
+            raise LostInRun(f"the board at {self.name} received nothing in time and vented by itself; start again")
         if status is not None and status.faults:
-            raise Tripped(f"the board vented by itself: {fault_names(status.faults)}; mend the cause and start again")
+            raise Tripped(f"the board vented by itself: {fault_names(status.faults)}; remove the cause and start again")
 
-    # ---- what is asked
+    # ---- requests
 
     def arm(self, robot: Robot) -> None:
-        """Check the board against the robot file and open a session that drives the robot's channels; still vented.
+        """Compare the board with the robot file and open a session for the robot's channels; it remains vented.
 
-        A fault that only says that a former host went away is cleared first. Raises `ProtocolMismatch` when board and
-        robot file differ, `Tripped` on any other latched fault, `LostInRun`.
+        A time-out fault of a previous host is cleared first. Raises `ProtocolMismatch` if board and robot file differ,
+        `Tripped` on any other latched fault, `LostInRun`.
         """
         channels = check_board(self.hello, robot, self.name)
         deadline = self._clock() + ARM_WAIT_S
-        self._line.wait(lambda: self._link.status is not None, deadline)
-        if self.status is not None and self.status.faults and not self.status.faults & ~GONE_HOST:
+        self._io_thread.wait(lambda: self._connection.status is not None, deadline)
+        if self.status is not None and self.status.faults and not self.status.faults & ~HOST_DISCONNECTED:
             self.clear_fault()
         while True:
-            self._line.wait(lambda: self._link.can_arm, deadline)
+            self._io_thread.wait(lambda: self._connection.can_arm, deadline)
             self.check()
-            with self._line.changed:
-                self._link.arm(channels, self.hello.p_full)
-            self._line.wait(lambda: not self._link.busy, deadline)
+            with self._io_thread.changed:
+                self._connection.arm(channels, self.hello.p_full)
+            self._io_thread.wait(lambda: not self._connection.busy, deadline)
             self.check()
             status = self.status
-            if status is not None and status.state == State.ARMED and self._link.armed:
+            if status is not None and status.state == State.ARMED and self._connection.armed:
                 self._p_max = self.hello.p_max
                 return
-            nack = self._link.refused
+            nack = self._connection.refused
             if nack is not None and nack.reason != NackReason.STATE:
-                raise ProtocolMismatch(f"board at {self.name} refused to be armed: {refusal(nack)}")
+                raise ProtocolMismatch(f"board at {self.name} refused to arm: {refusal(nack)}")
             if self._clock() >= deadline:
                 state = State(status.state).name if status is not None and status.state in set(State) else "unknown"
                 raise Tripped(f"board at {self.name} did not arm within {ARM_WAIT_S:.0f} s, its state is {state}")
-            self._line.wait(lambda: False, self._clock() + ARM_AGAIN_S)
+            self._io_thread.wait(lambda: False, self._clock() + ARM_RETRY_S)
 
     def set_pressures(self, tick: int, pressures_bar: ArrayLike) -> int:
-        """Have the set-points (channels,), bar, of this tick written, 2 ms at most; returns their sequence number.
+        """Send the set-points (channels,), bar, of this tick; returns after 2 ms at most, with the sequence number.
 
-        A shorter row is filled up with 0 (vented). Raises `Tripped` for a value that is no pressure of this robot, and
-        what `check` raises.
+        Missing channels are set to 0 (vented). Raises `Tripped` for a pressure out of range, ValueError for a wrong
+        shape, and what `check` raises.
         """
         self.check()
         pressures = np.array(pressures_bar, dtype=np.float64, ndmin=1)
         if pressures.ndim != 1 or len(pressures) > CHANNELS:
             raise ValueError(f"pressures of shape {pressures.shape}, expected (channels,), at most {CHANNELS}")
-        values = pressures.tolist()  # numbers of Python: for twelve of them much faster than arrays
+        values = pressures.tolist()  # for twelve values, lists are much faster than arrays
         if not all(math.isfinite(value * UNITS_PER_BAR) for value in values):
-            raise Tripped(f"no set-point is sent that is not a number: {values}")
+            raise Tripped(f"set-points {values} bar are not all finite; none is sent")
         units = [to_units(value) for value in values]
         if any(not 0 <= value <= self._p_max for value in units):
-            raise Tripped(f"set-points {values} bar leave the range from 0 to {to_bar(self._p_max):g} bar")
+            raise Tripped(f"set-points {values} bar, expected 0 to {to_bar(self._p_max):g} bar; none is sent")
         padded = tuple(units) + (0,) * (CHANNELS - len(units))
-        return self._line.send_and_wait(lambda: self._link.set(Set(tick & 0xFFFFFFFF, padded)))
+        return self._io_thread.send_and_wait(lambda: self._connection.set(Set(tick & 0xFFFFFFFF, padded)))
 
     def publish_tick(self, tick: int) -> None:
-        """Publish the control loop's counter on a tick that sends no set-points."""
-        with self._line.changed:
-            self._link.tick = tick & 0xFFFFFFFF
+        """Set the tick of the heartbeats, for a tick without set-points."""
+        with self._io_thread.changed:
+            self._connection.tick = tick & 0xFFFFFFFF
 
     def vent(self, mode: VentMode = VentMode.RAMP, timeout_s: float = VENT_WAIT_S) -> bool:
-        """Vent and wait; True only when the board itself said that every valve is at 0.
+        """Vent and wait; True only if the board reported that all valves are at 0.
 
-        A lost board is sent nothing (its own timer vents it); this then only listens whether it says so.
+        A lost board vents by its own timer; nothing is sent to it, only its reports are awaited.
         """
         since = self._clock()
-        with self._line.changed:
-            if self._link.phase is Phase.READY:
-                self._link.vent(mode)
-                self._line.wake()
-        if self._link.phase is Phase.READY:
-            self._line.wait(lambda: self._reported_vented(since), self._clock() + timeout_s)
-        if self._link.phase is Phase.LOST:
-            since = self._link.lost_at  # whatever it said from then on still holds: nobody told it to open a valve
+        with self._io_thread.changed:
+            if self._connection.phase is Phase.READY:
+                self._connection.vent(mode)
+                self._io_thread.wake()
+        if self._connection.phase is Phase.READY:
+            self._io_thread.wait(lambda: self._reported_vented(since), self._clock() + timeout_s)
+        if self._connection.phase is Phase.LOST:
+            since = self._connection.lost_at  # a later report is still valid: no set-points were sent
             if not self._listened:
-                self._listened = True  # once: nothing more will come after that
-                self._line.wait(lambda: self._reported_vented(since), self._clock() + LOST_VENT_WAIT_S)
+                self._listened = True  # once: nothing more is expected
+                self._io_thread.wait(lambda: self._reported_vented(since), self._clock() + LOST_VENT_WAIT_S)
         return self._reported_vented(since)
 
     def _reported_vented(self, since: float) -> bool:
-        return self._link.vented and self._link.status_at >= since and not self._link.busy
+        return self._connection.vented and self._connection.status_at >= since and not self._connection.busy
 
     def residual_pressures_bar(self) -> dict[int, float]:
-        """Channels whose sensor still measures pressure about a second after the venting, with that pressure, bar.
+        """Pressures, bar, of the channels that are still under pressure a second after venting.
 
-        Returns as soon as there is none; also where the board's word is too old to tell.
+        Returns as soon as there are none; empty if the last STATUS is too old.
         """
-        self._line.wait(lambda: not self._pressed(), self._clock() + DOWN_WAIT_S)
-        return {} if self._line.closed or self.status_age_s > STATUS_SILENCE_S else self._pressed()
+        self._io_thread.wait(lambda: not self._pressures_left(), self._clock() + DOWN_WAIT_S)
+        return {} if self._io_thread.closed or self.status_age_s > STATUS_SILENCE_S else self._pressures_left()
 
-    def _pressed(self) -> dict[int, float]:
+    def _pressures_left(self) -> dict[int, float]:
         measured_bar = self.measured_bar
-        pressed = np.flatnonzero(measured_bar >= to_bar(self.hello.p_down))
-        return {int(channel): float(measured_bar[channel]) for channel in pressed}
+        channels = np.flatnonzero(measured_bar >= to_bar(self.hello.p_down))
+        return {int(channel): float(measured_bar[channel]) for channel in channels}
 
     def clear_fault(self, mask: int | None = None) -> bool:
-        """Clear exactly these faults (None: all that are latched); True when the board did. It refuses while a sensor
-        still shows pressure."""
+        """Clear exactly these faults (None: all that are latched) and return whether none is left. The board refuses
+        while a channel is under pressure."""
         status = self.status
         if mask is None:
             mask = status.faults if status is not None else 0
-        with self._line.changed:
-            self._link.clear_fault(mask)
-        self._line.wait(lambda: not self._link.busy, self._clock() + CLEAR_WAIT_S)
+        with self._io_thread.changed:
+            self._connection.clear_fault(mask)
+        self._io_thread.wait(lambda: not self._connection.busy, self._clock() + CLEAR_WAIT_S)
         return self.status is not None and self.status.faults == 0
 
     def close(self) -> bool:
-        """Vent, where that is not yet done, and close the port. Returns whether the board said that it is vented."""
-        vented = self._link.phase is Phase.READY and self._link.vented
+        """Vent, unless vented, and close the port. Returns whether the board reported that it is vented."""
+        vented = self._connection.phase is Phase.READY and self._connection.vented
         try:
             return vented or self.vent()
         finally:
-            self._line.close()
+            self._io_thread.close()
 
     def __enter__(self) -> Board:
         return self
@@ -271,20 +266,20 @@ class Board:
 
     def _await_hello(self) -> None:
         deadline = self._clock() + (HELLO_WAIT_S + 1) * (RESETS + 1)
-        self._line.wait(lambda: self._link.phase is not Phase.WAITING, deadline)
-        if self._link.foreign_hash is not None:
+        self._io_thread.wait(lambda: self._connection.phase is not Phase.WAITING, deadline)
+        if self._connection.foreign_hash is not None:
             raise ProtocolMismatch(
-                f"the board at {self.name} speaks protocol {self._link.foreign_hash:08x}, this version speaks "
+                f"the board at {self.name} uses protocol {self._connection.foreign_hash:08x}, expected "
                 f"{PROTOCOL_HASH:08x}: flash the firmware of this version (make -C firmware flash PORT={self.name})"
             )
-        if self._link.phase is Phase.READY:
+        if self._connection.phase is Phase.READY:
             return
-        if not self._link.gave_up:
-            raise DeviceAbsent(f"board at {self.name}: {self._link.lost}")
-        heard = self._link.counts["bytes"]
-        what = f"{heard} bytes came that are not its language: wrong baud rate?" if heard else "not a byte came"
-        tried = f", {self._link.resets} resets included" if self._link.resets else ""
+        if self._connection.discovery.failure is None:
+            raise DeviceAbsent(f"board at {self.name}: {self._connection.lost}")
+        received, resets = self._connection.counts["bytes"], self._connection.discovery.resets
+        what = f"received {received} bytes of another protocol: wrong baud rate?" if received else "no byte received"
+        after = f" after {resets} resets" if resets else ""
         raise DeviceAbsent(
-            f"nothing at {self.name} announced itself as our board{tried} ({what}); "
-            f"another port, or flash the firmware (make -C firmware flash PORT={self.name})"
+            f"no board found at {self.name}{after} ({what}); "
+            f"give another port, or flash the firmware (make -C firmware flash PORT={self.name})"
         )

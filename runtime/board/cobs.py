@@ -1,14 +1,14 @@
-"""Consistent overhead byte stuffing: any bytes, written without a zero, so that a zero can end a frame."""
+"""Consistent overhead byte stuffing (COBS): encodes bytes without zeros, so that zeros can delimit frames."""
 
 from __future__ import annotations
 
 
 class FrameError(ValueError):
-    """These bytes are no frame of this protocol."""
+    """The bytes are not a frame of this protocol."""
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Return `data` without zero bytes (consistent overhead byte stuffing), delimiters not included."""
+    """Encode `data` without zero bytes; delimiters are not included."""
     encoded = bytearray()
     for run in data.split(b"\0"):
         while len(run) >= 254:
@@ -21,7 +21,7 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def cobs_decode(encoded: bytes) -> bytes:
-    """Return what `cobs_encode` was given; `FrameError` where that is impossible."""
+    """Decode the result of `cobs_encode`; `FrameError` for bytes that it cannot produce."""
     decoded = bytearray()
     position = 0
     while position < len(encoded):

@@ -1,4 +1,4 @@
-"""Whether a board is set up for a robot file: everything that can be compared before a valve moves."""
+"""Compares the configuration of a board with a robot file, before any valve moves."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ from modsoft.runtime.board.protocol import Hello, to_bar, to_units
 from modsoft.runtime.errors import ProtocolMismatch, RobotFileError
 from modsoft.runtime.robot import Robot
 
-LONGEST_STEP = 1.5  # periods between two commands of a loop that misses none: one in time, the next half a period late
+LONGEST_STEP = 1.5  # periods, largest time between two commands of a loop that misses none
 
 
 def check_board(hello: Hello, robot: Robot, name: str) -> int:
-    """Return the mask of the valve channels that the robot uses; bit c stands for channel c.
+    """Return the mask of the valve channels that the robot uses; bit c is channel c.
 
-    name: the board's port, for messages. Raises `ProtocolMismatch` where valve full scale, pressure range, slew,
-    control time-out or channels of board and robot file do not go together, `RobotFileError` for a robot without
-    valves.
+    name: port of the board, for messages. Raises `ProtocolMismatch` if valve full scale, pressure range, slew, control
+    time-out or channels of board and robot file differ, `RobotFileError` for a robot without valves.
     """
     valve = robot.valve
     if valve is None:
-        raise RobotFileError(f"robot {robot.name} has no valves, so there is nothing to run on a board")
+        raise RobotFileError(f"robot {robot.name} has no [valve], expected one: the board drives valves")
     checks = (
         ("valve full scale", hello.p_full, valve.full_scale_bar, "P_FULL", "full_scale_bar"),
         ("smallest pressure", hello.p_min, valve.p_min_bar, "P_MIN", "p_min_bar"),
@@ -32,14 +31,14 @@ def check_board(hello: Hello, robot: Robot, name: str) -> int:
             )
     if hello.slew > to_units(robot.limits.slew_bar_per_s):
         raise ProtocolMismatch(
-            f"the board at {name} moves pressures at {to_bar(hello.slew):g} bar/s, the robot file allows "
+            f"slew: the board at {name} has {to_bar(hello.slew):g} bar/s, the robot file allows "
             f"{robot.limits.slew_bar_per_s:g}; correct SLEW in firmware/limits.h and flash it, or slew_bar_per_s"
         )
     longest_s = hello.control_timeout_ms / 1000
     if longest_s <= LONGEST_STEP * robot.loop.period_s:
         raise ProtocolMismatch(
-            f"the board at {name} vents when no control step comes for {longest_s:g} s, and at {robot.loop.hz:g} Hz up "
-            f"to {LONGEST_STEP * robot.loop.period_s:g} s may lie between two; raise hz under [loop] in the robot "
+            f"control time-out: the board at {name} has {longest_s:g} s, expected more than "
+            f"{LONGEST_STEP * robot.loop.period_s:g} s at {robot.loop.hz:g} Hz; raise hz under [loop] in the robot "
             "file, or CONTROL_TIMEOUT_MS in firmware/limits.h"
         )
     for chamber in robot.chambers:

@@ -1,50 +1,39 @@
-"""The host's end of the wire as a state machine: bytes and times in, bytes out; no port, no thread, no clock.
+"""The host's side of the protocol as a state machine: bytes and times in, bytes out; no port, no thread, no clock.
 
-    WAITING --HELLO--> READY --anything odd--> LOST
+    WAITING --HELLO--> READY --any error--> LOST
 
-WAITING sends nothing: a host that talks at once keeps the MEGA's bootloader listening for an upload for ever. READY
-sends heartbeats, set-points and requests. LOST sends nothing more, for the same reason and because silence vents the
-board by its own timer; it never leaves LOST, so no set-point that was meant for before is sent after.
+WAITING sends nothing at first: the MEGA's bootloader would take the bytes for an upload and wait indefinitely. READY
+sends heartbeats, set-points and requests. LOST sends nothing, for the same reason, and because the board vents by its
+own timer. LOST is final, so that no outdated set-point is ever sent.
 """
 
 from __future__ import annotations
 
 from enum import Enum
 
+from modsoft.runtime.board.codec import ForeignHello, Parser, WireFrame, encode, message_id
+from modsoft.runtime.board.discovery import Discovery
 from modsoft.runtime.board.protocol import (
     ARM_AFTER_MS,
     HEARTBEAT_PERIOD_MS,
     PROTOCOL_HASH,
     Arm,
     ClearFault,
-    Fault,
-    ForeignHello,
     Heartbeat,
     Hello,
-    HelloReq,
     Message,
     Nack,
-    NackReason,
-    Parser,
     ResetCause,
     Set,
     State,
     Status,
     Vent,
     VentMode,
-    WireFrame,
-    encode,
-    message_id,
+    refusal,
 )
 
-HELLO_WAIT_S = 3.0  # then the board is reset through DTR
-RESETS = 3
-RESET_PULSE_S = 0.1
-RUNNING_AFTER_S = 1.5  # the bootloader's window is over by then: a STATUS means the firmware runs and can be asked
-STRANGER_AFTER_S = 2.5  # a second after that
-STRANGER_TALKS_S = 0.5  # in which our firmware would have said five things
-STATUS_SILENCE_S = 0.35  # three at 10 Hz, and a little
-ACK_WAIT_S = 0.2  # twenty times the usual round trip
+STATUS_SILENCE_S = 0.35  # three periods of STATUS and a margin
+ACK_WAIT_S = 0.2  # twenty times the usual round-trip time
 MISSED_ACKS = 3
 RETRY_S = 0.05
 RETRIES = 3
@@ -52,26 +41,26 @@ HEARTBEAT_S = HEARTBEAT_PERIOD_MS / 1000
 
 
 class Phase(Enum):
-    """How far the conversation is."""
+    """Phase of a connection."""
 
-    WAITING = "waiting for the board to announce itself"
+    WAITING = "waiting for HELLO"
     READY = "connected"
     LOST = "lost"
 
 
 class _Request:
-    """A message that is repeated until the board's STATUS shows its effect."""
+    """A message that is repeated until a STATUS shows its effect."""
 
     def __init__(self, message: Message, retries: float) -> None:
         self.message = message
         self.left = retries + 1
-        self.due = 0.0  # at once
+        self.due = 0.0  # immediately
 
 
 class Connection:
-    """One conversation with one board. Times are seconds of one monotonic clock, `now` never runs backwards.
+    """A connection to one board. Times are seconds of a monotonic clock.
 
-    resettable: False where the device is known not to be a MEGA, and is not to be reset.
+    resettable: False for a device that is known not to be a MEGA and must not be reset.
     """
 
     def __init__(self, now: float, resettable: bool = True) -> None:
@@ -80,25 +69,19 @@ class Connection:
         self.foreign_hash: int | None = None
         self.status: Status | None = None
         self.status_at = now
-        self.lost: str | None = None  # why, in words
+        self.lost: str | None = None  # the reason
         self.lost_at = now
-        self.gave_up = False  # nothing announced itself, not even after all resets; or something else talks there
-        self.resets = 0  # tried so far
-        self.dtr = True  # what the port's DTR line should be; its rising edge resets the board
-        self.ack_latency_s: float | None = None  # of the last SET, once it is acknowledged in time
-        self.missed_acks = 0  # in a row
-        self.refused: Nack | None = None  # the answer to the last request, when it was no
+        self.discovery = Discovery(now, resettable)
+        self.ack_latency_s: float | None = None  # of the last SET, after its acknowledgement
+        self.missed_acks = 0  # consecutive
+        self.refused: Nack | None = None  # reply to the last request, if it was refused
         self.counts = dict.fromkeys(("bytes", "bad_frames", "refused", "sets", "missed_acks"), 0)  # for the log
         self.tick = 0
         self.session = 0
-        self.armed = False  # the board opened the session that was asked for last
+        self.armed = False  # the board opened the requested session
         self.heartbeats_since: float | None = None
 
         self._parser = Parser()
-        self._asked_at = self._opened_at = now
-        self._resettable = resettable
-        self._talks_since: float | None = None  # bytes of any kind, from when on the firmware had to be running
-        self._pulse_until: float | None = None
         self._heartbeat_due = now
         self._board_session = 0
         self._seq = 0
@@ -107,10 +90,10 @@ class Connection:
         self._refused_set = ""
         self._request: _Request | None = None
 
-    # ---- what the owner asks for
+    # ---- requests of the owner
 
     def set(self, message: Set) -> int:
-        """Queue set-points for the next `poll`; one not sent yet is replaced. Returns the sequence number."""
+        """Queue set-points for the next `poll`, in place of those not yet sent. Returns the sequence number."""
         self.tick = message.tick
         self._seq = (self._seq + 1) & 0xFF
         self._set = (self._seq, message)
@@ -118,7 +101,7 @@ class Connection:
         return self._seq
 
     def arm(self, channels: int, p_full: int) -> None:
-        """Ask for a new session that drives the channels of this mask; READY only."""
+        """Request a new session that drives the channels of this mask; READY only."""
         assert self.hello is not None
         self.refused = None
         self.armed = False
@@ -126,45 +109,44 @@ class Connection:
         self._request = _Request(Arm(PROTOCOL_HASH, self.hello.boot_id, session, channels, p_full), RETRIES)
 
     def vent(self, mode: VentMode) -> None:
-        """Ask for venting, again and again until the board says that it left the session."""
+        """Request venting; repeated until the board has left the session."""
         self._set = None
         self._request = _Request(Vent(mode), float("inf"))
 
     def clear_fault(self, mask: int) -> None:
-        """Ask to clear exactly these faults."""
+        """Request to clear exactly these faults."""
         self.refused = None
         self._request = _Request(ClearFault(mask), RETRIES)
 
-    def close(self, why: str, now: float) -> None:
-        """The port failed, or the owner gives up."""
-        self._lose(why, now)
+    def close(self, reason: str, now: float) -> None:
+        """End the connection, for instance after an error of the port."""
+        self._lose(reason, now)
 
-    # ---- what the board is known to do
+    # ---- state of the board
 
     @property
     def vented(self) -> bool:
-        """Whether the board's last word was that every valve is at 0, and will stay there."""
+        """Whether, by the last STATUS, all valves are at 0 and the board drives none of them."""
         status = self.status
         return status is not None and status.state not in (State.ARMED, State.RUNNING) and not any(status.applied)
 
     @property
     def busy(self) -> bool:
-        """Whether a request still waits for its effect."""
+        """Whether a request is pending."""
         return self._request is not None
 
     @property
     def can_arm(self) -> bool:
-        """Whether the board has had its second of heartbeats (and a few more, one may be lost)."""
+        """Whether the board has received heartbeats for a second, and a margin for one that is lost."""
         wait_s = ARM_AFTER_MS / 1000 + 1.5 * HEARTBEAT_S
         return self.heartbeats_since is not None and self.status_at - self.heartbeats_since >= wait_s
 
     # ---- bytes in
 
     def feed(self, data: bytes, now: float) -> None:
-        """Take what came from the port."""
+        """Process bytes from the port."""
         self.counts["bytes"] += len(data)
-        if self._talks_since is None and now - self._opened_at >= RUNNING_AFTER_S:
-            self._talks_since = now
+        self.discovery.on_bytes(now)
         for frame in self._parser.feed(data):
             if isinstance(frame, ForeignHello):
                 self._on_foreign(frame.protocol_hash, now)
@@ -181,7 +163,7 @@ class Connection:
 
     def _on_foreign(self, protocol_hash: int, now: float) -> None:
         self.foreign_hash = protocol_hash
-        self._lose(f"the board speaks another protocol ({protocol_hash:08x}, ours is {PROTOCOL_HASH:08x})", now)
+        self._lose(f"the board uses protocol {protocol_hash:08x}, expected {PROTOCOL_HASH:08x}", now)
 
     def _on_hello(self, hello: Hello, now: float) -> None:
         if hello.protocol_hash != PROTOCOL_HASH:
@@ -189,7 +171,7 @@ class Connection:
         elif self.phase is Phase.WAITING:
             self.hello = hello
             self.phase = Phase.READY
-            self.status = None  # what came before, came from before the reset
+            self.status = None  # from before the reset
             self.status_at = self._heartbeat_due = now
         elif self.hello is not None and hello.boot_id != self.hello.boot_id:
             cause = ResetCause(hello.reset_cause).name if hello.reset_cause in set(ResetCause) else "?"
@@ -197,7 +179,7 @@ class Connection:
 
     def _on_status(self, status: Status, frame: WireFrame, now: float) -> None:
         self.status, self.status_at = status, now
-        if self.hello is None:  # not announced; once LOST, nothing is left that a status could change
+        if self.hello is None:  # in LOST, a status has no effect
             return
         if status.boot_id != self.hello.boot_id:
             self._lose("the board restarted by itself", now)
@@ -205,7 +187,7 @@ class Connection:
         if status.acked_seq in self._unacked and frame.session == self.session:
             self.ack_latency_s = now - self._unacked[status.acked_seq]
             self.missed_acks = 0
-            for seq in list(self._unacked):  # in the order they were sent; the newer ones still wait
+            for seq in list(self._unacked):  # in the order of sending; newer ones remain
                 del self._unacked[seq]
                 if seq == status.acked_seq:
                     break
@@ -234,7 +216,7 @@ class Connection:
     def _on_nack(self, nack: Nack) -> None:
         self.counts["refused"] += 1
         if nack.nacked_type == message_id(Set) and self._unacked.pop(nack.nacked_seq, None) is not None:
-            self.missed_acks += 1  # heard, but no better than unheard: the valves stay at the old set-points
+            self.missed_acks += 1  # counts as missed: the valves keep the old set-points
             self._refused_set = f" (refused: {refusal(nack)})"
         request = self._request
         if request is not None and nack.nacked_type == message_id(type(request.message)):
@@ -245,11 +227,14 @@ class Connection:
     # ---- bytes out
 
     def poll(self, now: float) -> bytes:
-        """Let time pass; returns what has to be written now."""
+        """Advance to `now` and return the bytes to write."""
         if self.phase is Phase.WAITING:
-            return self._wait_for_hello(now)
+            out = self.discovery.poll(now, None if self.status is None else self.status_at)
+            if self.discovery.failure is not None:
+                self._lose(self.discovery.failure, now)
+            return out
         if self.phase is Phase.READY:
-            self._watch(now)
+            self._check_timeouts(now)
         if self.phase is not Phase.READY:
             return b""
         out = self._next_request(now)
@@ -259,56 +244,25 @@ class Connection:
             self._unacked[seq] = now
             self.counts["sets"] += 1
             out += encode(message, seq, self.session)
-        # While an ARM is on its way nobody knows which session a heartbeat would have to name.
+        # While an ARM is pending, the session number for a heartbeat is unknown.
         arming = self._request is not None and isinstance(self._request.message, Arm)
         if now >= self._heartbeat_due and not arming:
             if self.heartbeats_since is None or now - self._heartbeat_due > HEARTBEAT_S:
-                self.heartbeats_since = now  # the board counts anew after a gap
+                self.heartbeats_since = now  # the board restarts its count after a gap
             self._heartbeat_due = max(self._heartbeat_due + HEARTBEAT_S, now)
             out += encode(Heartbeat(self.tick), 0, self.session)
         return out
 
-    def _wait_for_hello(self, now: float) -> bytes:
-        if self._pulse_until is not None:
-            if now >= self._pulse_until:
-                self._pulse_until = None
-                self.dtr = True
-                self._asked_at = self._opened_at = now
-            return b""
-        if (
-            self.status is not None
-            and now - self._opened_at >= RUNNING_AFTER_S
-            and now - self.status_at < HEARTBEAT_S * 2
-        ):
-            # It never restarted when the port was opened (some adapters do not), so its HELLO is long gone.
-            self._opened_at = now  # asked again after the same time
-            return encode(HelloReq(PROTOCOL_HASH))
-        # A device that runs something else is not made ours by a reset.
-        talks = self._talks_since is not None and now - self._talks_since >= STRANGER_TALKS_S
-        if self.status is None and (talks or not self._resettable) and now - self._asked_at >= STRANGER_AFTER_S:
-            self.gave_up = True
-            self._lose("what is there does not speak this protocol", now)
-        elif now - self._asked_at >= HELLO_WAIT_S:
-            if self.resets == RESETS or not self._resettable:
-                self.gave_up = True
-                self._lose("nothing announced itself", now)
-            else:
-                self.resets += 1
-                self._talks_since = None
-                self.dtr = False
-                self._pulse_until = now + RESET_PULSE_S
-        return b""
-
-    def _watch(self, now: float) -> None:
+    def _check_timeouts(self, now: float) -> None:
         for seq, sent in list(self._unacked.items()):
             if now - sent > ACK_WAIT_S:
                 del self._unacked[seq]
                 self.missed_acks += 1
                 self.counts["missed_acks"] += 1
         if self.missed_acks >= MISSED_ACKS:
-            self._lose(f"{self.missed_acks} set-points in a row were not acknowledged{self._refused_set}", now)
+            self._lose(f"{self.missed_acks} consecutive set-points were not acknowledged{self._refused_set}", now)
         elif now - self.status_at > STATUS_SILENCE_S:
-            self._lose(f"no word from the board for {now - self.status_at:.2f} s", now)
+            self._lose(f"no STATUS from the board for {now - self.status_at:.2f} s", now)
 
     def _next_request(self, now: float) -> bytes:
         request = self._request
@@ -321,22 +275,10 @@ class Connection:
         request.due = now + RETRY_S
         return encode(request.message, self._seq, self.session)
 
-    def _lose(self, why: str, now: float) -> None:
+    def _lose(self, reason: str, now: float) -> None:
         if self.phase is not Phase.LOST:
             self.phase = Phase.LOST
-            self.lost = why
+            self.lost = reason
             self.lost_at = now
             self._set = self._request = None
             self._unacked.clear()
-
-
-def fault_names(faults: int) -> str:
-    """The names in a mask of faults, such as "LINK_TIMEOUT, LEAK"."""
-    known = [str(fault.name) for fault in Fault if fault & faults]
-    unknown = faults & ~sum(Fault)
-    return ", ".join(known + ([f"0x{unknown:04x}"] if unknown else []))
-
-
-def refusal(nack: Nack) -> str:
-    """The reason in a NACK, in words."""
-    return NackReason(nack.reason).name.lower() if nack.reason in set(NackReason) else f"reason {nack.reason}"

@@ -1,4 +1,4 @@
-"""What stands in for the board in a dry run: set-points go nowhere, and nothing is said to be vented."""
+"""Replacement of the board in a dry run."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS, Status
 
 
-class Rehearsal:
-    """No valve moves; everything else of the loop is as in a run."""
+class DryRunBoard:
+    """Discards set-points; never reports a status."""
 
     status: Status | None = None
     status_age_s = float("nan")
@@ -21,10 +21,10 @@ class Rehearsal:
         self.statistics: dict[str, int] = {}
 
     def check(self) -> None:
-        """Nothing can be lost."""
+        """Always passes."""
 
     def set_pressures(self, tick: int, pressures_bar: Array) -> int:
         return tick & 0xFF
 
     def publish_tick(self, tick: int) -> None:
-        """Nobody listens."""
+        """Has no effect."""

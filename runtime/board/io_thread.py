@@ -1,7 +1,7 @@
-"""The serial line to the board: a thread that owns the port, and the lock that guards the `Connection` which it serves.
+"""The thread that owns the serial port of the board, and the lock of the `Connection` that it serves.
 
-The thread sends the heartbeats, but with the control loop's own counter in them, so that the board also notices a loop
-that is stuck while this thread lives.
+The thread sends the heartbeats with the tick of the control loop, so that the board also detects a control loop that
+is stuck while the thread runs.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from typing import TypeVar
 from modsoft.runtime.board.connection import Connection, Phase
 from modsoft.runtime.board.ports import READ_WAIT_S, Port
 
-HAND_OVER_S = 0.002  # ten times what it takes
+WRITE_TIMEOUT_S = 0.002  # ten times the usual duration
 T = TypeVar("T")
 
 
 class IoThread:
-    """What comes from the port goes to the link, what the link has to say goes out, until `close` or an error.
+    """Passes bytes between the port and the connection, until `close` or an error.
 
-    `changed` is held by whoever asks something of the link, and notified when something came. clock: monotonic seconds.
-    threaded: False serves the port from the calls that wait instead of a thread of its own, for tests on virtual time.
+    Hold `changed` to use the connection; it is notified when bytes arrive. clock: monotonic seconds. threaded: False
+    serves the port in the calls that wait, instead of in a thread, for tests on virtual time.
     """
 
-    def __init__(self, port: Port, link: Connection, clock: Callable[[], float], threaded: bool) -> None:
+    def __init__(self, port: Port, connection: Connection, clock: Callable[[], float], threaded: bool) -> None:
         self.changed = threading.Condition()
         self._port = port
-        self._link = link
+        self._connection = connection
         self._clock = clock
         self._dtr = True
-        self._away = False  # closed for the time of a reset
+        self._closed_for_reset = False
         self._stop = threading.Event()
         self._written = threading.Event()
         self._thread: threading.Thread | None = None
@@ -40,34 +40,33 @@ class IoThread:
 
     @property
     def closed(self) -> bool:
-        """Whether nothing is served any more."""
+        """Whether the port is no longer served."""
         return self._stop.is_set() or (self._thread is not None and not self._thread.is_alive())
 
     def wake(self) -> None:
-        """The thread of the port may sleep in a read; what was asked for is to go out now."""
+        """Interrupt a read of the thread, so that it writes immediately."""
         if self._thread is not None and not self.closed:
             self._port.cancel_read()
 
-    def send_and_wait(self, ask: Callable[[], T]) -> T:
-        """Returns what `ask`, which wants something of the link, returned: when that is written, or 2 ms later.
+    def send_and_wait(self, request: Callable[[], T]) -> T:
+        """Call `request`, which queues a message, and return its result after the message is written or after 2 ms.
 
-        The thread of the port needs the interpreter, so the caller steps aside for it, but a port that takes nothing
-        holds nobody up.
+        The wait lets the thread run; its limit keeps a blocked port from stopping the caller.
         """
         self._written.clear()
         with self.changed:
-            result = ask()
+            result = request()
         self.wake()
         if self._thread is not None:
-            self._written.wait(HAND_OVER_S)
+            self._written.wait(WRITE_TIMEOUT_S)
         return result
 
     def wait(self, condition: Callable[[], bool], deadline: float) -> None:
-        """Until `condition`, the loss of the board, or the deadline."""
+        """Wait for `condition`, the loss of the board or the deadline."""
         with self.changed:
-            lost = self._link.phase is Phase.LOST
+            was_lost = self._connection.phase is Phase.LOST
             while not condition() and self._clock() < deadline and not self.closed:
-                if not lost and self._link.phase is Phase.LOST:
+                if not was_lost and self._connection.phase is Phase.LOST:
                     return
                 if self._thread is None:
                     self.pump()
@@ -75,34 +74,34 @@ class IoThread:
                     self.changed.wait(0.05)
 
     def pump(self) -> bool:
-        """One turn: what came, what has to go. False when the port failed."""
+        """Read and write once. False if the port failed."""
         try:
             data = b""
-            if self._away:
+            if self._closed_for_reset:
                 self._stop.wait(READ_WAIT_S)
             else:
                 data = self._port.read(max(1, self._port.in_waiting))
             with self.changed:
                 now = self._clock()
                 if data:
-                    self._link.feed(data, now)
-                out = self._link.poll(now)
-                if data or self._link.phase is Phase.LOST:
+                    self._connection.feed(data, now)
+                out = self._connection.poll(now)
+                if data or self._connection.phase is Phase.LOST:
                     self.changed.notify_all()
             if out:
                 self._port.write(out)
                 self._written.set()
-            if self._link.dtr != self._dtr:
-                self._set_dtr(self._link.dtr)
-        except OSError as error:  # pyserial's own errors are OSErrors too
+            if self._connection.discovery.dtr != self._dtr:
+                self._set_dtr(self._connection.discovery.dtr)
+        except OSError as error:  # including pyserial's own errors
             with self.changed:
-                self._link.close(f"the port failed ({error})", self._clock())
+                self._connection.close(f"the port failed ({error})", self._clock())
             self._stop.set()
             return False
         return True
 
     def close(self) -> None:
-        """End the thread and close the port; nothing is vented."""
+        """End the thread and close the port, without venting."""
         self._stop.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=1.0)
@@ -114,21 +113,21 @@ class IoThread:
                 pass
         finally:
             with self.changed:
-                if not self._stop.is_set():  # a bug: nothing is sent any more, and the loop has to know
-                    self._link.close("the thread of the port ended by an error", self._clock())
+                if not self._stop.is_set():  # a bug in the thread, which the control loop must detect
+                    self._connection.close("the thread of the port ended by an error", self._clock())
                 self.changed.notify_all()
 
     def _set_dtr(self, level: bool) -> None:
-        """Reset the board: DTR down, then up."""
+        """Set DTR; low, then high resets the board."""
         self._dtr = level
         try:
-            if not self._away:
+            if not self._closed_for_reset:
                 self._port.dtr = level
                 return
         except OSError:
             pass
-        # A pseudo-terminal has no such line; what stands behind it takes closing and opening for it.
-        self._away = not level
+        # A pseudo-terminal has no DTR: the emulated board resets when its port is closed and opened.
+        self._closed_for_reset = not level
         if level:
             self._port.open()
         else:

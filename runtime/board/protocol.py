@@ -1,68 +1,65 @@
-"""The wire between host and board, defined here and nowhere else.
+"""Definition of the protocol between host and board: constants, states and messages.
 
 A frame is `0x00 | COBS(type u8, seq u8, session u8, payload, crc32) | 0x00`, little endian, at most
-`MAX_DECODED` bytes before the coding. The checksum is zlib's CRC-32 over everything before it; with a
-16-bit checksum a noisy line gets a wrong set-point through within minutes, with 32 bits it does not.
+`MAX_DECODED` bytes before the encoding. The checksum is zlib's CRC-32 over everything before it; with a
+16-bit checksum a noisy connection passes a wrong set-point within minutes, with 32 bits it does not.
 Pressures are signed 16-bit counts of 10 Pa (0.35 bar is 3500); 0 means vented, valve unpowered.
 
-Each message is a table of (field, C type) written as a NamedTuple. `tools/gen_protocol.py` writes
-firmware/protocol.h from the same tables. `PROTOCOL_HASH` is computed from them and travels in HELLO, so that
-a board that speaks anything else is refused. What never changes, so that strangers can be told apart: the
-framing, the ids of HELLO_REQ and HELLO, and the hash as the first field of both.
+Each message is a NamedTuple of (field, C type). `tools/gen_protocol.py` writes firmware/protocol.h from the
+same tables. HELLO contains `PROTOCOL_HASH`, computed from them, so that a board with another protocol is
+refused. Constant across versions, so that any version is recognised: the framing, the ids of HELLO_REQ and
+HELLO, and the hash as the first field of both.
 """
 
-import struct
 import zlib
 from enum import IntEnum, IntFlag
 from typing import Annotated, NamedTuple, get_type_hints
-
-from modsoft.runtime.board.cobs import FrameError, cobs_decode, cobs_encode
 
 DELIMITER = 0x00
 MAX_DECODED = 96  # bytes, header and checksum included
 MAX_ENCODED = MAX_DECODED + 1  # one COBS code byte serves up to 254 bytes
 HEADER_LENGTH = 3
 CRC_LENGTH = 4
-CHANNELS = 12  # pressures in every frame; how many of them a board can use is told in its HELLO
+CHANNELS = 12  # pressures in every frame; HELLO contains the number that the board can use
 PRESSURE_UNIT_PA = 10
-NOT_MEASURED = -32768  # stands for "this channel has no sensor" among the measured pressures
-SEQUENCE_WINDOW = 8  # a SET may run this far ahead of the last one accepted (lost frames), never behind it
+NOT_MEASURED = -32768  # measured pressure of a channel without a sensor
+SEQUENCE_WINDOW = 8  # largest distance of a SET from the last one accepted (lost frames); older ones are refused
 HEARTBEAT_PERIOD_MS = 100
 STATUS_PERIOD_MS = 100
-ARM_AFTER_MS = 1000  # unbroken heartbeats before the board lets itself be armed
+ARM_AFTER_MS = 1000  # of uninterrupted heartbeats before the board accepts ARM
 
 UNITS_PER_BAR = 100_000 // PRESSURE_UNIT_PA
 
 
 class State(IntEnum):
-    """What the board does; it moves between these only as the firmware's supervisor.c says."""
+    """State of the board; transitions are defined in firmware/supervisor.c."""
 
-    BOOT = 0  # pins low, not yet announced
+    BOOT = 0  # pins low, HELLO not yet sent
     IDLE = 1  # vented or venting; the only state that can be armed
-    ARMED = 2  # vented, waits for the first SET
+    ARMED = 2  # vented, waiting for the first SET
     RUNNING = 3  # follows the set-points
-    FAULT = 4  # vented or venting, latched until CLEAR_FAULT names exactly what happened
+    FAULT = 4  # vented or venting, latched until CLEAR_FAULT with exactly the latched faults
 
 
 class Fault(IntFlag):
-    """Why the board vented by itself; latched."""
+    """Reasons why the board vented by itself; latched."""
 
-    LINK_TIMEOUT = 0x0001  # no valid frame of the session for the link time-out
-    CONTROL_TIMEOUT = 0x0002  # frames came, but the control loop's tick stood still
-    OVER_PRESSURE = 0x0004  # a sensor read more than the limit for too long
-    LEAK = 0x0008  # a chamber stayed below its set-point
-    SENSOR = 0x0010  # a chamber stayed above its set-point: sensor or valve stuck
+    LINK_TIMEOUT = 0x0001  # no valid frame of the session within the link time-out
+    CONTROL_TIMEOUT = 0x0002  # frames arrived, but the tick of the control loop did not advance
+    OVER_PRESSURE = 0x0004  # a sensor measured more than the limit for too long
+    LEAK = 0x0008  # a chamber remained below its set-point
+    SENSOR = 0x0010  # a chamber remained above its set-point: sensor or valve stuck
 
 
 class VentMode(IntEnum):
-    """How fast a VENT lets go."""
+    """How fast a VENT reduces the pressures."""
 
     RAMP = 0  # at the slew limit
-    DUMP = 1  # at once
+    DUMP = 1  # immediately
 
 
 class NackReason(IntEnum):
-    """Why a frame that arrived intact was refused."""
+    """Why a valid frame was refused."""
 
     LENGTH = 1
     RANGE = 2
@@ -74,7 +71,7 @@ class NackReason(IntEnum):
 
 
 class ResetCause(IntEnum):
-    """What started the board; behind a bootloader this is inferred."""
+    """Cause of the last reset; behind a bootloader it is inferred."""
 
     UNKNOWN = 0
     POWER_ON = 1
@@ -84,7 +81,7 @@ class ResetCause(IntEnum):
 
 
 class CType(NamedTuple):
-    """One field type: its C name, its `struct` code, how many."""
+    """Type of a field: C name, `struct` code, number of elements."""
 
     name: str
     code: str
@@ -99,13 +96,13 @@ Pressures = Annotated[tuple[int, ...], CType("int16_t", "h", CHANNELS)]
 
 
 class HelloReq(NamedTuple):
-    """Host to board, any state: who are you?"""
+    """Host to board, any state: request for HELLO."""
 
     protocol_hash: U32
 
 
 class Hello(NamedTuple):
-    """Board to host: unasked once at boot, and in answer to HELLO_REQ. Pressures in 10 Pa, slew in 10 Pa/s."""
+    """Board to host: once at boot, and in reply to HELLO_REQ. Pressures in 10 Pa, slew in 10 Pa/s."""
 
     protocol_hash: U32
     firmware_version: U16
@@ -115,7 +112,7 @@ class Hello(NamedTuple):
     sensors: U16  # bit c is set where channel c has a pressure sensor
     p_min: I16
     p_max: I16
-    p_down: I16  # a channel that measures this or more still holds pressure
+    p_down: I16  # a channel that measures this or more is under pressure
     p_full: U32
     slew: U16
     link_timeout_ms: U16
@@ -123,25 +120,25 @@ class Hello(NamedTuple):
 
 
 class Arm(NamedTuple):
-    """Host to board, IDLE only, after a second of heartbeats. The board counts sessions, 1 to 255 and round again;
-    a new one must be the next, so an old ARM that comes back opens nothing."""
+    """Host to board, IDLE only, after a second of heartbeats. Sessions are numbered 1 to 255, cyclically; a new one
+    must be the next, so that a repeated old ARM is refused."""
 
     protocol_hash: U32
     boot_id: U32
     new_session: U8
-    channels: U16  # bit c is set where this session drives channel c; all others stay vented
-    p_full: U32  # full scale of the valves the host computes with
+    channels: U16  # bit c is set where this session drives channel c; others remain vented
+    p_full: U32  # full scale of the valves, as set on the host
 
 
 class Set(NamedTuple):
-    """Host to board: set-points of all channels, 0 to p_max; the newest wins, nothing is sent again."""
+    """Host to board: set-points of all channels, 0 to p_max. A newer one replaces it; never repeated."""
 
     tick: U32
     pressures: Pressures
 
 
 class Heartbeat(NamedTuple):
-    """Host to board at 10 Hz, sent by the I/O thread with the control loop's own counter."""
+    """Host to board at 10 Hz: sent by the I/O thread, with the tick of the control loop."""
 
     tick: U32
 
@@ -153,15 +150,15 @@ class Vent(NamedTuple):
 
 
 class ClearFault(NamedTuple):
-    """Host to board, FAULT only: names exactly the faults to clear, and only with the pressures down."""
+    """Host to board, FAULT only, after the pressures have decayed: clears exactly these faults."""
 
     mask: U16
 
 
 class Status(NamedTuple):
-    """Board to host: the answer to SET, ARM, VENT and CLEAR_FAULT, and at 10 Hz unasked. Pressures in 10 Pa."""
+    """Board to host: reply to SET, ARM, VENT and CLEAR_FAULT, and at 10 Hz. Pressures in 10 Pa."""
 
-    acked_seq: U8  # the last SET accepted (or known already)
+    acked_seq: U8  # the last SET accepted or repeated
     state: U8
     faults: U16
     boot_id: U32
@@ -172,11 +169,11 @@ class Status(NamedTuple):
     rx_good: U16
     rx_bad: U16
     rx_refused: U16
-    supply_mv: U16  # 0 where it is not measured
+    supply_mv: U16  # 0 if not measured
 
 
 class Nack(NamedTuple):
-    """Board to host: an intact frame was refused, all of it."""
+    """Board to host: a valid frame was refused as a whole."""
 
     nacked_type: U8
     nacked_seq: U8
@@ -185,7 +182,7 @@ class Nack(NamedTuple):
 
 Message = HelloReq | Hello | Arm | Set | Heartbeat | Vent | ClearFault | Status | Nack
 
-# (name, id, table): host to board below 0x80, board to host above.
+# (name, id, table); ids of host to board are below 0x80.
 MESSAGES: tuple[tuple[str, int, type], ...] = (
     ("HELLO_REQ", 0x01, HelloReq),
     ("ARM", 0x02, Arm),
@@ -198,7 +195,7 @@ MESSAGES: tuple[tuple[str, int, type], ...] = (
     ("NACK", 0x91, Nack),
 )
 ENUMS: tuple[type[IntEnum] | type[IntFlag], ...] = (State, Fault, VentMode, NackReason, ResetCause)
-# Names of the plain constants that the board needs too.
+# Names of the constants that firmware/protocol.h contains.
 CONSTANTS = (
     "DELIMITER",
     "MAX_DECODED",
@@ -215,20 +212,6 @@ CONSTANTS = (
 )
 
 
-class WireFrame(NamedTuple):
-    """One decoded frame."""
-
-    seq: int
-    session: int
-    message: Message
-
-
-class ForeignHello(NamedTuple):
-    """A HELLO whose layout is not ours; only the hash can be read."""
-
-    protocol_hash: int
-
-
 def fields(table: type) -> tuple[tuple[str, CType], ...]:
     """Return the (field, C type) rows of a message."""
     hints = get_type_hints(table, include_extras=True)
@@ -236,7 +219,7 @@ def fields(table: type) -> tuple[tuple[str, CType], ...]:
 
 
 def definition() -> str:
-    """Return the whole definition as text, one line a fact: what the hash is computed from."""
+    """Return the definition as text, the input of the hash: a line for each constant, value and field."""
     lines = [f"const {name} {globals()[name]}" for name in CONSTANTS]
     lines += [f"enum {enum.__name__} {member.name} {member.value}" for enum in ENUMS for member in enum]
     for name, identifier, table in MESSAGES:
@@ -248,100 +231,23 @@ def definition() -> str:
 PROTOCOL_HASH = zlib.crc32(definition().encode())
 
 
-class _Layout(NamedTuple):
-    identifier: int
-    table: type
-    packer: struct.Struct
-    counts: tuple[int, ...]
-
-
-def _layouts() -> tuple[_Layout, ...]:
-    result = []
-    for _, identifier, table in MESSAGES:
-        rows = [ctype for _, ctype in fields(table)]
-        packer = struct.Struct("<" + "".join(f"{row.repeat}{row.code}" for row in rows))
-        result.append(_Layout(identifier, table, packer, tuple(row.repeat for row in rows)))
-    return tuple(result)
-
-
-_BY_TYPE = {layout.table: layout for layout in _layouts()}
-_BY_ID = {layout.identifier: layout for layout in _BY_TYPE.values()}
-
-
-def message_id(table: type) -> int:
-    """Return the id of a message class."""
-    return _BY_TYPE[table].identifier
-
-
 def to_units(pressure_bar: float) -> int:
-    """Return a pressure in the wire's unit of 10 Pa, rounded to the nearest."""
+    """Return a pressure, bar, in units of 10 Pa, rounded to the nearest."""
     return round(pressure_bar * UNITS_PER_BAR)
 
 
 def to_bar(units: int) -> float:
-    """Return a pressure in bar from the wire's unit of 10 Pa."""
+    """Return a pressure in units of 10 Pa in bar."""
     return units / UNITS_PER_BAR
 
 
-def encode(message: Message, seq: int = 0, session: int = 0) -> bytes:
-    """Return the whole frame of a message, both delimiters included."""
-    layout = _BY_TYPE[type(message)]
-    values: list[int] = []
-    for value, count in zip(message, layout.counts, strict=True):
-        if count == 1:
-            values.append(value)  # type: ignore[arg-type]
-        elif len(value) == count:  # type: ignore[arg-type]
-            values.extend(value)  # type: ignore[arg-type]
-        else:
-            raise ValueError(f"{type(message).__name__} takes {count} values in a row, not {len(value)}")  # type: ignore[arg-type]
-    body = bytes((layout.identifier, seq, session)) + layout.packer.pack(*values)
-    return b"\0" + cobs_encode(body + zlib.crc32(body).to_bytes(CRC_LENGTH, "little")) + b"\0"
+def fault_names(faults: int) -> str:
+    """Return the names in a mask of faults, such as "LINK_TIMEOUT, LEAK"."""
+    known = [str(fault.name) for fault in Fault if fault & faults]
+    unknown = faults & ~sum(Fault)
+    return ", ".join(known + ([f"0x{unknown:04x}"] if unknown else []))
 
 
-def decode(encoded: bytes) -> WireFrame | ForeignHello:
-    """Return the message between two delimiters; `FrameError` says why there is none."""
-    if len(encoded) > MAX_ENCODED:
-        raise FrameError(f"frame of {len(encoded)} bytes, longer than {MAX_ENCODED}")
-    decoded = cobs_decode(encoded)
-    if len(decoded) < HEADER_LENGTH + CRC_LENGTH:
-        raise FrameError(f"frame of {len(decoded)} bytes, shorter than header and checksum")
-    body = decoded[:-CRC_LENGTH]
-    if zlib.crc32(body) != int.from_bytes(decoded[-CRC_LENGTH:], "little"):
-        raise FrameError("checksum differs")
-    payload = body[HEADER_LENGTH:]
-    layout = _BY_ID.get(body[0])
-    if layout is None:
-        raise FrameError(f"unknown message 0x{body[0]:02x}")
-    if len(payload) != layout.packer.size:
-        if layout.table is Hello and len(payload) >= 4:
-            return ForeignHello(int.from_bytes(payload[:4], "little"))
-        raise FrameError(f"{layout.table.__name__} of {len(payload)} bytes, not {layout.packer.size}")
-    values = iter(layout.packer.unpack(payload))
-    unpacked = [next(values) if count == 1 else tuple(next(values) for _ in range(count)) for count in layout.counts]
-    return WireFrame(body[1], body[2], layout.table(*unpacked))
-
-
-class Parser:
-    """Bytes in, messages out; what is no frame is dropped and counted in `errors`."""
-
-    def __init__(self) -> None:
-        self.errors = 0
-        self._tail = b""
-        self._overlong = False
-
-    def feed(self, data: bytes) -> list[WireFrame | ForeignHello]:
-        """Take the next bytes of the line, return the messages they complete."""
-        messages = []
-        *complete, self._tail = (self._tail + data).split(b"\0")
-        for encoded in complete:
-            if encoded or self._overlong:
-                try:
-                    if self._overlong:
-                        raise FrameError("frame without an end")
-                    messages.append(decode(encoded))
-                except FrameError:
-                    self.errors += 1
-                self._overlong = False
-        if len(self._tail) > MAX_ENCODED:
-            self._tail, self._overlong = b"", True
-        return messages
+def refusal(nack: Nack) -> str:
+    """Return the reason of a NACK in words."""
+    return NackReason(nack.reason).name.lower() if nack.reason in set(NackReason) else f"reason {nack.reason}"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.board.ports import ports_here
+from modsoft.runtime.board.ports import describe_ports
 from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.tracking.frame import TrackerFrame
 
@@ -162,7 +162,7 @@ def _connected(kind: str, port: str, tools: list[Path]) -> Any:
     else:
         settings["serial port"] = port
         if port.startswith("/") and not Path(port).exists():
-            raise DeviceAbsent(f"no tracker at {port}: no such port; {ports_here()}")
+            raise DeviceAbsent(f"no tracker at {port}: no such port; {describe_ports()}")
     try:
         tracker = TextNDI(settings)
         tracker.start_tracking()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from modsoft.runtime.board import protocol
+from modsoft.runtime.board import codec, protocol
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = "MODSOFT_NATIVE_FIRMWARE"
@@ -27,7 +27,7 @@ class NativeBoard:
             library.board_new(boot_id, int(protocol.ResetCause.POWER_ON), ctypes.c_uint32(start_ms))
         )
         self.measured = [0] * 6 + [protocol.NOT_MEASURED] * 6
-        self.parser = protocol.Parser()
+        self.parser = codec.Parser()
         self.session = 0
         self.seq = 0
         self.tick = 0
@@ -54,11 +54,11 @@ class NativeBoard:
             self.now_ms = (self.now_ms + 1) & 0xFFFFFFFF
             self.update()
 
-    def messages(self) -> list[protocol.WireFrame]:
+    def messages(self) -> list[codec.WireFrame]:
         """Return the frames that the board sent since the last call."""
         frames = self.parser.feed(self.drain())
         assert self.parser.errors == 0
-        assert all(isinstance(frame, protocol.WireFrame) for frame in frames)
+        assert all(isinstance(frame, codec.WireFrame) for frame in frames)
         return frames  # type: ignore[return-value]
 
     # ---- actions of a host
@@ -66,7 +66,7 @@ class NativeBoard:
     def send(self, message: protocol.Message, seq: int = 0, session: int | None = None) -> list[protocol.Message]:
         """Send one message, return the immediate answers of the board."""
         self.messages()
-        self.feed(protocol.encode(message, seq, self.session if session is None else session))
+        self.feed(codec.encode(message, seq, self.session if session is None else session))
         return [frame.message for frame in self.messages()]
 
     def heartbeats(self, milliseconds: int, ticking: bool = True) -> None:

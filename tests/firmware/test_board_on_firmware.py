@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot
-from modsoft.runtime.board import protocol
+from modsoft.runtime.board import codec, protocol
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import Fault, State, VentMode
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, RobotFileError, Tripped
@@ -104,9 +104,9 @@ class VirtualPort:
 
     def count(self, table):
         """Return how often a message was sent."""
-        identifier = protocol.message_id(table)
-        frames = [frame for _, data in self.written for frame in protocol.Parser().feed(data)]
-        return sum(protocol.message_id(type(frame.message)) == identifier for frame in frames)
+        identifier = codec.message_id(table)
+        frames = [frame for _, data in self.written for frame in codec.Parser().feed(data)]
+        return sum(codec.message_id(type(frame.message)) == identifier for frame in frames)
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def run(board, port, seconds, pressures=HALF, first_tick=1, hz=2.5):
         board.set_pressures(tick, pressures)
         until = port.clock() + 1 / hz
         while port.clock() < until:
-            board._line.pump()
+            board._io_thread.pump()
     return first_tick + round(seconds * hz)
 
 
@@ -177,12 +177,12 @@ def test_nothing_is_sent_before_hello(port):
 
 def run_pumps(board, times):
     for _ in range(times):
-        board._line.pump()
+        board._io_thread.pump()
 
 
 def test_silent_port_is_reset_three_times_before_the_error(new_board):
     port = VirtualPort(new_board, firmware=False)
-    with pytest.raises(DeviceAbsent, match="not a byte came"):
+    with pytest.raises(DeviceAbsent, match="no byte received"):
         connect(port)
     assert port.resets == 3
     assert port.written == []
@@ -264,8 +264,8 @@ def test_noise_instead_of_frames(new_board):
         ("full_scale_bar = 3.0", "full_scale_bar = 10.0", "valve full scale: .* has 3 bar, the robot file 10"),
         ("p_min_bar = 0.08", "p_min_bar = 0.1", "smallest pressure"),
         ("p_max_bar = 0.35", "p_max_bar = 0.3", "largest pressure"),
-        ("slew_bar_per_s = 2.0", "slew_bar_per_s = 1.0", "at 2 bar/s, the robot file allows 1"),
-        ("hz = 2.5", "hz = 1.5", "vents when no control step comes for 1 s, and at 1.5 Hz up to 1 s"),
+        ("slew_bar_per_s = 2.0", "slew_bar_per_s = 1.0", "has 2 bar/s, the robot file allows 1"),
+        ("hz = 2.5", "hz = 1.5", "has 1 s, expected more than 1 s at 1.5 Hz"),
         ("channel = 5", "channel = 11", "channel 11, the board at virtual has channels 0 to 10"),
     ],
 )
@@ -278,7 +278,7 @@ def test_board_that_does_not_fit_the_robot_file_is_never_armed(rig, old, new, co
 
 
 def test_cable_robot_has_nothing_to_arm(rig):
-    with pytest.raises(RobotFileError, match="no valves"):
+    with pytest.raises(RobotFileError, match="expected one: the board drives valves"):
         rig[0].arm(robot.load("cable-4"))
 
 
@@ -350,7 +350,7 @@ def test_board_detects_a_stopped_control_loop(rig):
     run(board, port, 2)
     stopped_at = port.now_ms
     while any(port.board.counts):
-        board._line.pump()  # the I/O thread still runs
+        board._io_thread.pump()  # the I/O thread still runs
     assert port.now_ms - stopped_at <= 1400
     assert port.board.faults == Fault.CONTROL_TIMEOUT
     run_pumps(board, 40)
@@ -375,7 +375,7 @@ def test_unplugged_cable(rig):
     board.arm(ROBOT)
     tick = run(board, port, 2)
     port.unplugged = True
-    board._line.pump()
+    board._io_thread.pump()
     with pytest.raises(LostInRun, match="the port failed"):
         board.set_pressures(tick, HALF)
     assert board.vent() is False
@@ -398,7 +398,7 @@ def test_after_three_lost_set_points_the_host_reports_the_loss_and_stops_sending
     tick = run(board, port, 2)
     original = port.write
     port.write = lambda data: None if len(data) > 20 else original(data)  # heartbeats pass, set-points do not
-    with pytest.raises(LostInRun, match="3 set-points in a row were not acknowledged"):
+    with pytest.raises(LostInRun, match="3 consecutive set-points were not acknowledged"):
         run(board, port, 4, first_tick=tick)
     port.write = original
     silent_from = len(port.written)
@@ -421,8 +421,8 @@ def test_board_that_sends_nothing_is_lost(rig):
     port.sends_nothing = True
     silent_at = port.now_ms
     while board.lost is None:
-        board._line.pump()
-    assert "no word from the board" in board.lost
+        board._io_thread.pump()
+    assert "no STATUS from the board" in board.lost
     assert port.now_ms - silent_at <= 460
     assert board.vent() is False  # it vented, but could not report it
     assert not any(port.board.counts)
@@ -438,7 +438,7 @@ def test_board_reset_in_mid_run(rig):
     port.reset()
     reset_at = port.now_ms
     while board.lost is None:
-        board._line.pump()
+        board._io_thread.pump()
     assert port.now_ms - reset_at <= 1200
     with pytest.raises(LostInRun):
         board.set_pressures(99, HALF)
@@ -474,7 +474,7 @@ def test_vented_is_a_status_from_after_the_request(rig):
     requested_ms = max(
         at
         for at, data in port.written
-        for frame in protocol.Parser().feed(data)
+        for frame in codec.Parser().feed(data)
         if isinstance(frame.message, protocol.Vent)
     )
     assert port.now_ms - 1e3 * board.status_age_s > requested_ms
@@ -507,7 +507,7 @@ def test_residual_pressure_is_compared_with_the_limit_that_the_board_reports(rig
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
-    board._link.hello = board.hello._replace(p_down=p_down)
+    board._connection.hello = board.hello._replace(p_down=p_down)
     port.follows = False  # the sensors keep showing 0.2 bar
     port.board.measured[1:6] = [0] * 5
     assert board.vent()

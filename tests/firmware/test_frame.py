@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modsoft.runtime.board import cobs, protocol
+from modsoft.runtime.board import cobs, codec, protocol
 
 
 @pytest.mark.parametrize("kind", ["flip", "drop", "insert", "truncate", "garbage", "repeat"])
@@ -80,7 +80,7 @@ def test_only_the_end_of_a_valid_frame_returns_true(board):
     """The sketch takes one valid frame in a pass."""
     receive = board.library.supervisor_receive
     receive.restype = ctypes.c_bool
-    good = b"\0" + protocol.encode(protocol.HelloReq(protocol.PROTOCOL_HASH), 1, 0).lstrip(b"\0")
+    good = b"\0" + codec.encode(protocol.HelloReq(protocol.PROTOCOL_HASH), 1, 0).lstrip(b"\0")
     ends = [receive(board.handle, byte, ctypes.c_uint32(5)) for byte in good]
     assert ends == [False] * (len(good) - 1) + [True]
     assert not any(receive(board.handle, byte, ctypes.c_uint32(5)) for byte in b"\0\x05\x05\0")

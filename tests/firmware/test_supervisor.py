@@ -7,7 +7,7 @@ import zlib
 
 import pytest
 
-from modsoft.runtime.board import cobs, protocol
+from modsoft.runtime.board import cobs, codec, protocol
 from modsoft.runtime.board.protocol import ClearFault, Fault, Hello, HelloReq, NackReason, State, Status, Vent, VentMode
 
 FULL = (3500,) * 6
@@ -333,7 +333,7 @@ def test_clock_and_tick_may_wrap(new_board, start_ms, ticks):
 @pytest.mark.parametrize("extra", [-1, 1])
 @pytest.mark.parametrize("message", [protocol.Vent(0), protocol.Heartbeat(1), protocol.Set(1, (0,) * 12)])
 def test_wrong_length_refused(running, message, extra):
-    whole = cobs.cobs_decode(protocol.encode(message, 1, running.session)[1:-1])[:-4]
+    whole = cobs.cobs_decode(codec.encode(message, 1, running.session)[1:-1])[:-4]
     body = whole[:-1] if extra < 0 else whole + b"\0"
     running.messages()
     running.feed(b"\0" + with_crc(body) + b"\0")
@@ -378,7 +378,7 @@ def test_lost_host_while_armed_is_a_fault_too(board):
 
 
 def test_garbage_and_corrupted_frames_do_not_feed_the_link_timer(running):
-    good = protocol.encode(protocol.Heartbeat(1000), 0, running.session)
+    good = codec.encode(protocol.Heartbeat(1000), 0, running.session)
     for _ in range(310):
         running.feed(good[:5] + b"\x55" + good[6:] + b"\xaa\x00")
         running.wait(1)
@@ -576,21 +576,21 @@ def test_no_set_point_opens_a_valve_while_idle(board):
 
 
 def test_queue_for_the_host_holds_255_bytes(board):
-    board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH)) * 3)
-    board.feed(protocol.encode(Vent(VentMode.RAMP)))
+    board.feed(codec.encode(HelloReq(protocol.PROTOCOL_HASH)) * 3)
+    board.feed(codec.encode(Vent(VentMode.RAMP)))
     board.feed(b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0")
     raw = board.drain()
-    kinds = [type(frame.message) for frame in protocol.Parser().feed(raw)]
+    kinds = [type(frame.message) for frame in codec.Parser().feed(raw)]
     assert kinds == [Hello] * 4 + [Status, protocol.Nack]
     assert len(raw) == 255
 
 
 def test_queue_for_the_host_does_not_hold_256_bytes(board):
     """A full ring buffer would look like an empty one: 256 bytes must not be queued."""
-    board.feed(protocol.encode(Vent(VentMode.RAMP)) * 2)
+    board.feed(codec.encode(Vent(VentMode.RAMP)) * 2)
     board.feed((b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0") * 4)
     raw = board.drain()
-    kinds = [type(frame.message) for frame in protocol.Parser().feed(raw)]
+    kinds = [type(frame.message) for frame in codec.Parser().feed(raw)]
     assert kinds == [Hello, Status, Status] + [protocol.Nack] * 3
     assert len(raw) + len(raw) - raw.rindex(b"\0\0") - 1 == 256  # with the last refusal
 
@@ -598,13 +598,13 @@ def test_queue_for_the_host_does_not_hold_256_bytes(board):
 def test_board_never_waits_for_a_host_that_does_not_read(board):
     board.start(800)
     for _ in range(100):
-        board.feed(protocol.encode(HelloReq(protocol.PROTOCOL_HASH), 0, board.session))
-        board.feed(protocol.encode(protocol.Heartbeat(board.tick + 1), 0, board.session))
+        board.feed(codec.encode(HelloReq(protocol.PROTOCOL_HASH), 0, board.session))
+        board.feed(codec.encode(protocol.Heartbeat(board.tick + 1), 0, board.session))
         board.tick += 1
         board.wait(100)
         board.follow()
     assert board.state == State.RUNNING
-    board.parser = protocol.Parser()
+    board.parser = codec.Parser()
     assert board.messages()  # complete frames only
 
 

@@ -14,7 +14,8 @@ import time
 
 import serial
 
-from modsoft.runtime.board.protocol import PROTOCOL_HASH, Arm, Heartbeat, Hello, Parser, Set, Status, encode, to_units
+from modsoft.runtime.board.codec import Parser, encode
+from modsoft.runtime.board.protocol import PROTOCOL_HASH, Arm, Heartbeat, Hello, Set, Status, to_units
 
 BAUD = 250_000
 PERIOD_S = 0.1

@@ -10,7 +10,8 @@ import pytest
 import serial
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
-from modsoft.runtime.board.protocol import PROTOCOL_HASH, Hello, HelloReq, Parser, ResetCause, encode
+from modsoft.runtime.board.codec import Parser, encode
+from modsoft.runtime.board.protocol import PROTOCOL_HASH, Hello, HelloReq, ResetCause
 
 BAUD = 250_000
 HELLO_TIMEOUT_S = 5.0

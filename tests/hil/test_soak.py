@@ -51,7 +51,7 @@ def events(*duties):
     return [{**pwm, "duty": duty, "t_us": 1e3 * at, "mono_ns": at * 10**6} for at, duty in duties]
 
 
-LOST = "modsoft-runtime: board at /dev/ttyACM0 lost: no word from the board for 0.35 s"
+LOST = "modsoft-runtime: board at /dev/ttyACM0 lost: no STATUS from the board for 0.35 s"
 
 
 @pytest.mark.parametrize(

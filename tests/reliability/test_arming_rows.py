@@ -8,6 +8,7 @@ from stepped_port import SteppedPort
 from modsoft.hil.board.emulator import EmulatedBoard, missing_packages
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board import connection
+from modsoft.runtime.board.codec import Parser, encode
 from modsoft.runtime.board.protocol import (
     PROTOCOL_HASH,
     Arm,
@@ -16,10 +17,8 @@ from modsoft.runtime.board.protocol import (
     HelloReq,
     Nack,
     NackReason,
-    Parser,
     State,
     Status,
-    encode,
 )
 from modsoft.runtime.errors import ProtocolMismatch
 

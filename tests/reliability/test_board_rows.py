@@ -17,6 +17,7 @@ from output_rises import rises
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event, missing_packages
 from modsoft.hil.outputs import read_outputs
+from modsoft.runtime.board.codec import Parser, encode
 from modsoft.runtime.board.protocol import (
     CHANNELS,
     PROTOCOL_HASH,
@@ -24,11 +25,9 @@ from modsoft.runtime.board.protocol import (
     Heartbeat,
     Hello,
     HelloReq,
-    Parser,
     Set,
     State,
     Status,
-    encode,
     to_units,
 )
 from modsoft.runtime.errors import LostInRun, Tripped
@@ -276,7 +275,7 @@ def test_row_30_host_does_not_read(matrix_row, full):
 
     def attempt(_):
         with in_stepped_run() as (host, emulated):
-            port, since, session = host.port, len(emulated.trace), host.board._link.session
+            port, since, session = host.port, len(emulated.trace), host.board._connection.session
             tick, seq = host.tick, host.board.set_pressures(host.tick, [Host.BAR] * 6)
             for step in range(seconds * 10):
                 tick += 1

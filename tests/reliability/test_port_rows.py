@@ -46,7 +46,7 @@ def test_row_07_plugged_in_again_under_another_name(matrix_row, tmp_path, monkey
             idle_s = second.clock() - plugged["t_us"] * 1e-6
             idle_until_s = second.clock() + 0.5
             while second.clock() < idle_until_s:
-                second.board._line.pump()
+                second.board._io_thread.pump()
             assert second.board.status.state == State.IDLE, "never by itself"
             second.board.arm(Host.ROBOT)
             assert second.board.status.state == State.ARMED
@@ -70,7 +70,7 @@ def test_row_07_plugged_in_again_under_another_name(matrix_row, tmp_path, monkey
 
 
 def await_state(board, state, limit_s=5.0):
-    board._line.wait(lambda: board.status is not None and board.status.state == state, board._clock() + limit_s)
+    board._io_thread.wait(lambda: board.status is not None and board.status.state == state, board._clock() + limit_s)
     assert board.status.state == state
 
 
@@ -99,7 +99,7 @@ def test_row_07_the_next_run_finds_the_board_by_its_serial_number(matrix_row, mo
         _, since = inject(stand.board, f"plug {new_name}")
         with Run(stand, model_file, tmp_path / "second", program=program) as run:
             assert run.process.wait(30) == 69
-        assert f"there is an Arduino MEGA at {new_name}, which --port {number}" in run.said
+        assert f"found an Arduino MEGA at {new_name}, which --port {number}" in run.said
         assert not [event for event in stand.board.trace[since:] if event["event"] == "uart-open"], "nothing opened"
         with Run(stand, model_file, tmp_path / "third", "--port", number, "--steps", "3", program=program) as run:
             assert run.left()[0] == 0, run.said
@@ -280,7 +280,7 @@ def test_row_24_port_busy_not_permitted_or_of_another_device(matrix_row, tmp_pat
 def time_to_give_up():
     """Seconds until a port without a byte is given up, and the number of resets before."""
     silent, hundredths = connection.Connection(0.0), 0
-    while not silent.gave_up:
+    while silent.discovery.failure is None:
         hundredths += 1
         assert silent.poll(hundredths / 100) == b""
-    return hundredths / 100, silent.resets
+    return hundredths / 100, silent.discovery.resets

@@ -210,7 +210,7 @@ def test_row_11_the_fault_stays_latched_for_a_host_that_comes_back(fault, error,
     def beat_for(host, seconds):
         until_s = host.clock() + seconds
         while host.clock() < until_s:
-            host.board._line.pump()
+            host.board._io_thread.pump()
 
     tries = 50 if full else 3
     for _ in range(tries):

@@ -1,6 +1,6 @@
-"""`Board` through a real serial port driver, in real time, on the emulated MEGA (without simavr the native board).
+"""`Board` on a pseudo-terminal, in real time, with the emulated MEGA (without simavr the native board).
 
-What happens to it under faults: tests/reliability.
+Faults are tested in tests/reliability.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def emulated():
 
 @pytest.fixture
 def running(emulated):
-    """A board in mid-run at 0.2 bar, and its `EmulatedBoard`."""
+    """A running board at 0.2 bar, and its `EmulatedBoard`."""
     board = Board.open(emulated.port)
     board.arm(ROBOT)
     ticks(board, 1, 2)
     yield board, emulated
-    board._line.close()
+    board._io_thread.close()
 
 
 def ticks(board, first, count):
@@ -52,7 +52,7 @@ def ticks(board, first, count):
     return latencies
 
 
-def test_whole_run(emulated):
+def test_run(emulated):
     opened = time.monotonic()
     with Board.open(emulated.port) as board:
         open_s = time.monotonic() - opened
@@ -77,27 +77,27 @@ def test_reset_causes(emulated):
         assert board.hello.reset_cause == ResetCause.EXTERNAL
 
 
-def test_first_announcement_lost_then_reset_through_the_line(emulated):
-    """A pseudo-terminal has no DTR: closing and opening stand for it."""
+def test_board_is_reset_when_its_first_hello_is_lost(emulated):
+    """A pseudo-terminal has no DTR: closing and opening it resets the board."""
 
-    def speak_again():
+    def stop_dropping():
         emulated.wait_for(is_event("uart-close"), 6.0)
         emulated.send("drop-tx 0")
 
     emulated.send("drop-tx 1")
     emulated.wait_for(is_event("command", line="drop-tx 1"), 2.0)
     opened = time.monotonic()
-    helper = threading.Thread(target=speak_again)
+    helper = threading.Thread(target=stop_dropping)
     helper.start()
     with Board.open(emulated.port) as board:
-        took = time.monotonic() - opened
+        took_s = time.monotonic() - opened
         helper.join()
         board.arm(ROBOT)
-    assert 3.1 < took < 5.5
+    assert 3.1 < took_s < 5.5
     assert len([event for event in emulated.trace if event["event"] == "uart-open"]) == 2
 
 
-def test_dump(running):
+def test_venting_by_dump(running):
     board, emulated = running
     assert board.vent(VentMode.DUMP)
     assert not any(emulated.duties())

@@ -8,7 +8,8 @@ import pytest
 from board_messages import HELLO, IDLE, OPEN, ZERO, frames, messages, ready
 
 from modsoft.runtime.board.cobs import cobs_encode
-from modsoft.runtime.board.connection import Connection, Phase, encode, message_id
+from modsoft.runtime.board.codec import encode, message_id
+from modsoft.runtime.board.connection import Connection, Phase
 from modsoft.runtime.board.protocol import PROTOCOL_HASH, Heartbeat, Hello, HelloReq, ResetCause, Set, State
 
 FOREIGN_HASH = 0x0123ABCD
@@ -19,12 +20,18 @@ FOREIGN_HASH = 0x0123ABCD
 
 def test_new_connection_waits_and_knows_nothing():
     connection = Connection(5.0)
-    assert (connection.phase, connection.dtr, connection.resets) == (Phase.WAITING, True, 0)
+    assert (connection.phase, connection.discovery.dtr, connection.discovery.resets) == (Phase.WAITING, True, 0)
     assert connection.hello is connection.foreign_hash is connection.status is connection.lost is None
     assert connection.ack_latency_s is connection.refused is connection.heartbeats_since is None
     assert (connection.status_at, connection.lost_at) == (5.0, 5.0)
     assert (connection.tick, connection.session, connection.missed_acks) == (0, 0, 0)
-    flags = (connection.gave_up, connection.armed, connection.busy, connection.can_arm, connection.vented)
+    flags = (
+        connection.discovery.failure is not None,
+        connection.armed,
+        connection.busy,
+        connection.can_arm,
+        connection.vented,
+    )
     assert flags == (False,) * 5
     assert connection.counts == {"bytes": 0, "bad_frames": 0, "refused": 0, "sets": 0, "missed_acks": 0}
 
@@ -33,20 +40,24 @@ def test_silent_board_is_reset_three_times_then_given_up():
     connection, opened = Connection(10.0), 10.0
     for reset in range(1, 4):
         assert connection.poll(opened + 2.99) == b""
-        assert (connection.dtr, connection.resets) == (True, reset - 1)
+        assert (connection.discovery.dtr, connection.discovery.resets) == (True, reset - 1)
         low = opened + 3.0
         assert connection.poll(low) == b""
-        assert (connection.dtr, connection.resets) == (False, reset)
+        assert (connection.discovery.dtr, connection.discovery.resets) == (False, reset)
         assert connection.poll(low + 0.095) == b""
-        assert not connection.dtr
+        assert not connection.discovery.dtr
         opened = low + 0.1
         assert connection.poll(opened) == b""
-        assert connection.dtr
+        assert connection.discovery.dtr
     connection.poll(opened + 2.99)
-    assert (connection.phase, connection.gave_up) == (Phase.WAITING, False)
+    assert (connection.phase, connection.discovery.failure is not None) == (Phase.WAITING, False)
     assert connection.poll(opened + 3.0) == b""
-    assert (connection.phase, connection.gave_up, connection.resets) == (Phase.LOST, True, 3)
-    assert connection.lost == "nothing announced itself"
+    assert (connection.phase, connection.discovery.failure is not None, connection.discovery.resets) == (
+        Phase.LOST,
+        True,
+        3,
+    )
+    assert connection.lost == connection.discovery.failure == "no HELLO received"
     assert connection.lost_at == opened + 3.0
 
 
@@ -59,7 +70,7 @@ def test_running_board_is_asked_for_hello_once_in_a_while():
     connection.feed(encode(IDLE), 12.9)
     assert connection.poll(12.99) == b""
     assert messages(connection.poll(13.0)) == [HelloReq(PROTOCOL_HASH)]
-    assert connection.resets == 0
+    assert connection.discovery.resets == 0
 
 
 @pytest.mark.parametrize(("age_s", "asked"), [(0.19, True), (0.2, False), (0.25, False)])
@@ -88,7 +99,7 @@ def test_bytes_from_before_a_reset_do_not_count_after_it():
     assert connection.phase is Phase.WAITING
     connection.feed(b"noise", 4.7)
     connection.poll(5.8)
-    assert (connection.phase, connection.lost) == (Phase.LOST, "what is there does not speak this protocol")
+    assert (connection.phase, connection.lost) == (Phase.LOST, "the device does not use this protocol")
 
 
 @pytest.mark.parametrize(("first_byte_s", "lost"), [(11.49, False), (11.5, True), (12.0, True), (12.04, False)])
@@ -98,7 +109,11 @@ def test_other_device_is_one_that_sends_for_half_a_second_once_firmware_had_to_r
     connection.poll(12.49)
     assert connection.phase is Phase.WAITING
     connection.poll(12.5)
-    assert (connection.phase is Phase.LOST, connection.gave_up, connection.resets) == (lost, lost, 0)
+    assert (connection.phase is Phase.LOST, connection.discovery.failure is not None, connection.discovery.resets) == (
+        lost,
+        lost,
+        0,
+    )
 
 
 # ---- HELLO
@@ -116,7 +131,7 @@ def test_hello_of_another_protocol_ends_the_connection(start, hello):
     connection = start()
     connection.feed(hello, 0.3)
     assert (connection.phase, connection.foreign_hash, connection.lost_at) == (Phase.LOST, FOREIGN_HASH, 0.3)
-    assert f"another protocol (0123abcd, ours is {PROTOCOL_HASH:08x})" in connection.lost
+    assert f"the board uses protocol 0123abcd, expected {PROTOCOL_HASH:08x}" in connection.lost
     assert connection.poll(0.4) == b""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from board_messages import IDLE, OPEN, ZERO, frames, messages, ready
 
-from modsoft.runtime.board.connection import encode, message_id
+from modsoft.runtime.board.codec import encode, message_id
 from modsoft.runtime.board.protocol import (
     PROTOCOL_HASH,
     Arm,

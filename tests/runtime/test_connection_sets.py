@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 from board_messages import HELLO, IDLE, ZERO, frames
 
-from modsoft.runtime.board.connection import Connection, Phase, encode, fault_names, message_id, refusal
-from modsoft.runtime.board.protocol import Arm, Heartbeat, Nack, NackReason, Set, State
+from modsoft.runtime.board.codec import encode, message_id
+from modsoft.runtime.board.connection import Connection, Phase
+from modsoft.runtime.board.protocol import Arm, Heartbeat, Nack, NackReason, Set, State, fault_names, refusal
 
 RUNNING = IDLE._replace(state=State.RUNNING)
 
@@ -110,7 +111,7 @@ def test_three_missed_acknowledgements_in_a_row_end_the_connection(connection):
     connection.set(Set(4, ZERO))
     assert connection.poll(0.3) == b""
     assert (connection.phase, connection.lost_at) == (Phase.LOST, 0.3)
-    assert connection.lost == "3 set-points in a row were not acknowledged"
+    assert connection.lost == "3 consecutive set-points were not acknowledged"
 
 
 def test_refused_set_counts_as_missed_and_names_the_reason(connection):
@@ -120,7 +121,7 @@ def test_refused_set_counts_as_missed_and_names_the_reason(connection):
             refuse(connection, Set, seq, 0.01 * number)
             assert (connection.missed_acks, connection.counts["refused"]) == (number, 2 * number - 2 + refusals)
     connection.poll(0.05)
-    assert connection.lost == "3 set-points in a row were not acknowledged (refused: range)"
+    assert connection.lost == "3 consecutive set-points were not acknowledged (refused: range)"
     assert connection.counts["missed_acks"] == 0
 
 

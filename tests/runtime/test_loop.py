@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from virtual_loop import PERIOD_S, ROBOT, World
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime.board.dry_run import Rehearsal
+from modsoft.runtime.board.dry_run import DryRunBoard
 from modsoft.runtime.board.protocol import CHANNELS
 from modsoft.runtime.control.actuation import channel_pressures_bar
 from modsoft.runtime.control.features import (
@@ -348,7 +348,7 @@ def test_a_rehearsal_runs_the_task_without_a_board():
         loop.desired,
         loop.frames,
         loop.validator,
-        Rehearsal(),
+        DryRunBoard(),
         loop.ticker,
         loop.stop,
         loop.log,

@@ -1,4 +1,4 @@
-"""The wire: what goes in comes out, what is damaged does not, and the firmware's header says the same."""
+"""Frames are decoded as encoded, corrupted ones are dropped, and the firmware's header has the same definition."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modsoft.runtime.board import cobs, protocol
+from modsoft.runtime.board import cobs, codec, protocol
 
 ROOT = Path(__file__).resolve().parents[2]
 RANGES = {"uint8_t": (0, 0xFF), "uint16_t": (0, 0xFFFF), "uint32_t": (0, 0xFFFFFFFF), "int16_t": (-0x8000, 0x7FFF)}
@@ -23,7 +23,7 @@ def values(ctype):
     return one if ctype.repeat == 1 else st.tuples(*[one] * ctype.repeat)
 
 
-def messages():
+def any_message():
     return st.one_of(
         [
             st.builds(table, **{name: values(ctype) for name, ctype in protocol.fields(table)})
@@ -35,13 +35,13 @@ def messages():
 BYTE = st.integers(0, 255)
 
 
-@given(messages(), BYTE, BYTE)
+@given(any_message(), BYTE, BYTE)
 def test_round_trip(message, seq, session):
-    encoded = protocol.encode(message, seq, session)
+    encoded = codec.encode(message, seq, session)
     assert encoded[0] == encoded[-1] == 0
     assert 0 not in encoded[1:-1]
     assert len(encoded) <= protocol.MAX_ENCODED + 2
-    assert protocol.decode(encoded[1:-1]) == protocol.WireFrame(seq, session, message)
+    assert codec.decode(encoded[1:-1]) == codec.WireFrame(seq, session, message)
 
 
 @given(st.binary(max_size=1000))
@@ -51,33 +51,33 @@ def test_cobs_round_trip(data):
     assert cobs.cobs_decode(encoded) == data
 
 
-@given(st.lists(st.one_of(messages(), st.binary(min_size=1, max_size=20)), max_size=8), st.integers(1, 40))
-def test_parser_finds_every_message_in_any_pieces(items, piece):
+@given(st.lists(st.one_of(any_message(), st.binary(min_size=1, max_size=20)), max_size=8), st.integers(1, 40))
+def test_parser_finds_every_message_in_chunks_of_any_size(items, size):
     stream = b"".join(
-        protocol.encode(item) if not isinstance(item, bytes) else b"\0" + item.replace(b"\0", b"\1") + b"\0"
+        codec.encode(item) if not isinstance(item, bytes) else b"\0" + item.replace(b"\0", b"\1") + b"\0"
         for item in items
     )
-    parser = protocol.Parser()
-    found = []
-    for start in range(0, len(stream), piece):
-        found += [frame.message for frame in parser.feed(stream[start : start + piece])]
-    assert found == [item for item in items if not isinstance(item, bytes)]
+    parser = codec.Parser()
+    messages = []
+    for start in range(0, len(stream), size):
+        messages += [frame.message for frame in parser.feed(stream[start : start + size])]
+    assert messages == [item for item in items if not isinstance(item, bytes)]
     assert parser.errors == sum(isinstance(item, bytes) for item in items)
 
 
-@given(messages(), st.data())
-def test_one_flipped_bit_is_always_found(message, data):
-    encoded = bytearray(protocol.encode(message)[1:-1])
+@given(any_message(), st.data())
+def test_one_flipped_bit_is_detected(message, data):
+    encoded = bytearray(codec.encode(message)[1:-1])
     at = data.draw(st.integers(0, len(encoded) * 8 - 1))
     encoded[at // 8] ^= 1 << (at % 8)
-    assert protocol.Parser().feed(bytes(encoded) + b"\0") == []
+    assert codec.Parser().feed(bytes(encoded) + b"\0") == []
 
 
-def test_damaged_lines_let_nothing_through():
+def test_corrupted_frames_are_dropped():
     random.seed(3)
-    parser = protocol.Parser()
+    parser = codec.Parser()
     sent = protocol.Set(1, tuple(range(12)))
-    good = protocol.encode(sent, 1, 1)
+    good = codec.encode(sent, 1, 1)
     for _ in range(5000):
         noisy = bytearray(good)
         for _ in range(random.randint(1, 3)):
@@ -87,38 +87,38 @@ def test_damaged_lines_let_nothing_through():
         assert [frame.message for frame in parser.feed(good)] == [sent]
 
 
-def test_endless_frame_takes_no_memory_and_is_counted_once():
-    parser = protocol.Parser()
+def test_endless_frame_needs_no_memory_and_counts_once():
+    parser = codec.Parser()
     for _ in range(1000):
         assert parser.feed(b"\xff" * 1000) == []
     assert len(parser._tail) <= protocol.MAX_ENCODED
-    good = protocol.encode(protocol.Vent(0))
+    good = codec.encode(protocol.Vent(0))
     assert [frame.message for frame in parser.feed(good)] == [protocol.Vent(0)]
     assert parser.errors == 1
 
 
-def test_wrong_lengths_and_types_are_no_messages():
+def test_wrong_lengths_and_types_are_refused():
     with pytest.raises(cobs.FrameError, match="shorter"):
-        protocol.decode(cobs.cobs_encode(b"abc"))
+        codec.decode(cobs.cobs_encode(b"abc"))
     with pytest.raises(cobs.FrameError, match="longer"):
-        protocol.decode(b"\x01" * 98)
-    for body, complaint in ((b"\x77\0\0", "unknown message 0x77"), (b"\x12\0\0\0\0", "Vent of 2 bytes, not 1")):
-        with pytest.raises(cobs.FrameError, match=complaint):
-            protocol.decode(sealed(body))
+        codec.decode(b"\x01" * 98)
+    for body, message in ((b"\x77\0\0", "unknown message 0x77"), (b"\x12\0\0\0\0", "Vent of 2 bytes, not 1")):
+        with pytest.raises(cobs.FrameError, match=message):
+            codec.decode(with_crc(body))
 
 
-def sealed(body):
+def with_crc(body):
     return cobs.cobs_encode(body + zlib.crc32(body).to_bytes(4, "little"))
 
 
-def test_hello_of_another_protocol_still_tells_its_hash():
-    stranger = (0x1234).to_bytes(4, "little") + b"anything"
-    assert protocol.decode(sealed(b"\x81\0\0" + stranger)) == protocol.ForeignHello(0x1234)
+def test_hash_of_another_protocol_is_decoded():
+    payload = (0x1234).to_bytes(4, "little") + b"anything"
+    assert codec.decode(with_crc(b"\x81\0\0" + payload)) == codec.ForeignHello(0x1234)
 
 
-def test_set_takes_all_channels():
-    with pytest.raises(ValueError, match="Set takes 12 values in a row, not 6"):
-        protocol.encode(protocol.Set(1, (0,) * 6))
+def test_set_requires_all_channels():
+    with pytest.raises(ValueError, match="Set takes 12 values, not 6"):
+        codec.encode(protocol.Set(1, (0,) * 6))
 
 
 @given(st.integers(-32767, 32767))
@@ -150,7 +150,7 @@ def test_firmware_header_is_up_to_date():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_header_out_of_date_is_noticed(tmp_path):
+def test_outdated_header_is_detected(tmp_path):
     (tmp_path / "tools").mkdir()
     (tmp_path / "firmware").mkdir()
     copy = tmp_path / "tools" / "gen_protocol.py"

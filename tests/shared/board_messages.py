@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from modsoft.runtime.board.connection import Connection, Parser, encode
-from modsoft.runtime.board.protocol import CHANNELS, PROTOCOL_HASH, Hello, Message, State, Status, WireFrame
+from modsoft.runtime.board.codec import Parser, WireFrame, encode
+from modsoft.runtime.board.connection import Connection
+from modsoft.runtime.board.protocol import CHANNELS, PROTOCOL_HASH, Hello, Message, State, Status
 
 HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 500, 30000, 20000, 300, 1000)
 ZERO = (0,) * CHANNELS

@@ -7,19 +7,8 @@ import serial
 
 from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.runtime.board import protocol
-from modsoft.runtime.board.protocol import (
-    Arm,
-    ClearFault,
-    Heartbeat,
-    Hello,
-    HelloReq,
-    Parser,
-    Set,
-    State,
-    Status,
-    Vent,
-    encode,
-)
+from modsoft.runtime.board.codec import Parser, encode
+from modsoft.runtime.board.protocol import Arm, ClearFault, Heartbeat, Hello, HelloReq, Set, State, Status, Vent
 
 BAUD = 250_000
 HEARTBEAT_S = 0.1

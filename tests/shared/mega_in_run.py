@@ -57,7 +57,7 @@ class Host:
             if self.threaded:
                 time.sleep(max(0.0, min(self.due_s, until_s, now_s + CHECK_S) - now_s))
             else:
-                self.board._line.pump()
+                self.board._io_thread.pump()
 
 
 @contextlib.contextmanager
@@ -71,7 +71,7 @@ def in_run(threaded=True):
             host.run_for(random.uniform(0.0, Host.PERIOD_S))
             yield host, emulated
         finally:
-            host.board._line.close()
+            host.board._io_thread.close()
 
 
 @contextlib.contextmanager

@@ -38,7 +38,7 @@ class SteppedRun:
         self.port = SteppedPort(emulated)
         self.clock = self.port.clock
         self.board = Board(self.port, "the emulated MEGA", self.clock, threaded=False)
-        self._pump, self.board._line.pump = self.board._line.pump, self.pump
+        self._pump, self.board._io_thread.pump = self.board._io_thread.pump, self.pump
         self.frames, self.stop, self.statistics = LatestFrame(), Stop(), TickStatistics(ROBOT, STEPS)
         self.stop.wait = self.wait
         self.log = RunLog(folder, ROBOT.name, "", {})
@@ -59,7 +59,7 @@ class SteppedRun:
     def wait(self, seconds):
         until_s = self.clock() + seconds
         while self.clock() < until_s and self.stop.error is None and self.board.lost is None:
-            self.board._line.pump()
+            self.board._io_thread.pump()
 
     def actuate(self, features):
         """The model: full pressure on one side of every module, as fast as the limits allow."""

@@ -29,8 +29,9 @@ from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board.board import Board
+from modsoft.runtime.board.codec import encode
 from modsoft.runtime.board.ports import open_port
-from modsoft.runtime.board.protocol import CHANNELS, Set, encode
+from modsoft.runtime.board.protocol import CHANNELS, Set
 from modsoft.runtime.clock import Ticker, spinning
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.control.model import Model

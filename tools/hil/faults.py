@@ -169,7 +169,7 @@ def acknowledged_late(tick: TickRecord, before: TickRecord) -> bool:
 def noise(name: str, row: int, command: str, probability: float, *counters: str) -> Fault:
     """Noise on the serial line until a counter of the connection shows it; a run may lose the board by it."""
     begin, undo = board(f"{command} {probability}"), board(f"{command} 0")
-    return Fault(name, row, begin, undo, None, counted(*counters), LOST, "not acknowledged|no word|did not hear")
+    return Fault(name, row, begin, undo, None, counted(*counters), LOST, "not acknowledged|no STATUS|received nothing")
 
 
 BOARD_ALONE_MS = 700.0  # cable pulled: the link time-out and the ramp from the highest pressure
@@ -267,7 +267,7 @@ FAULTS = [
         send_signal(signal.SIGCONT),
         2.5,
         codes=(74, 79),
-        message="did not hear|missed|tracker|lost|vented by itself",
+        message="received nothing|missed|tracker|lost|vented by itself",
         vents_ms=SILENT_HOST_MS,
     ),
 ]
