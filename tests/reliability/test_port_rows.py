@@ -99,7 +99,7 @@ def test_row_07_the_next_run_finds_the_board_by_its_serial_number(matrix_row, mo
         _, since = inject(stand.board, f"plug {new_name}")
         with Run(stand, model_file, tmp_path / "second", program=program) as run:
             assert run.process.wait(30) == 69
-        assert f"found an Arduino MEGA at {new_name}, which --port {number}" in run.said
+        assert f"found an Arduino MEGA at {new_name}; give its serial number, --port {number}" in run.said
         assert not [event for event in stand.board.trace[since:] if event["event"] == "uart-open"], "nothing opened"
         with Run(stand, model_file, tmp_path / "third", "--port", number, "--steps", "3", program=program) as run:
             assert run.left()[0] == 0, run.said
