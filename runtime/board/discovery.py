@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from modsoft.runtime.board.codec import encode
-from modsoft.runtime.board.protocol import HEARTBEAT_PERIOD_MS, PROTOCOL_HASH, HelloReq
+from modsoft.runtime.board.protocol import PROTOCOL_HASH, HelloReq
 
 HELLO_WAIT_S = 3.0  # then the board is reset through DTR
 RESETS = 3
@@ -11,7 +11,7 @@ RESET_PULSE_S = 0.1
 RUNNING_AFTER_S = 1.5  # the bootloader has ended by then: a STATUS means that the firmware runs
 FOREIGN_AFTER_S = 2.5  # one second later
 FOREIGN_BYTES_S = 0.5  # in this time our firmware sends five frames
-STATUS_AGE_S = 2 * HEARTBEAT_PERIOD_MS / 1000
+STATUS_AGE_S = 0.2  # two periods of STATUS: the board is still sending
 
 
 class Discovery:
