@@ -1,4 +1,4 @@
-"""The checkpoint `model.pt`: a dict of tensors and plain Python values that says all about the model it holds.
+"""The checkpoint `model.pt`: a dict of tensors and plain Python values that describes the model completely.
 
     schema      int, SCHEMA
     robot       the robot file of the data set, as plain values
@@ -7,10 +7,9 @@
     features    ordered names of the F features
     weights     state dict
     provenance  {"data_sha256", "seed", "code_version", "date", "split", "samples", "iterations", "errors_percent", ...}
-    resume      what training needs to go on (optimiser, random states); absent in a finished model
 
-It is read with `weights_only=True`, so that a file from a stranger runs no code, and only when every checksum holds,
-the archive is one that torch.save writes, and the tensors are no larger than the file.
+Checkpoints are untrusted: they are read with `weights_only=True`, so that no code in them runs, and refused where a
+checksum is wrong, the archive is not one of torch.save, or a tensor is larger than its bytes in the file.
 """
 
 from __future__ import annotations
@@ -32,27 +31,27 @@ from modsoft.training import networks
 
 SCHEMA = 1
 KEYS = {"schema": int, "robot": dict, "network": dict, "features": list, "weights": dict, "provenance": dict}
-OLD_FORMAT = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # how torch.save began before version 1.6
-# What zipfile and torch raise for other files and for damaged ones.
+OLD_FORMAT = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # first bytes of a file of torch.save before version 1.6
+# Errors of zipfile and torch for other files and for damaged ones.
 NOT_READABLE = (OSError, EOFError, RuntimeError, ValueError, LookupError, zipfile.BadZipFile, zlib.error)
 
 
 def save(checkpoint: dict[str, Any], path: Path) -> None:
-    """Writes to a temporary name beside `path` and renames, so that a kill leaves the old file or the new one."""
+    """Writes to a temporary file beside `path` and renames it, so that a kill leaves the old file or the new one."""
     with written(path) as temporary:
         try:
             torch.save(checkpoint, temporary)
-        except RuntimeError as error:  # what torch makes of a full disk
+        except RuntimeError as error:  # torch's error for a full disk
             raise OSError(str(error).splitlines()[0]) from error
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Whatever dict torch stored at `path`, unchecked: a checkpoint, or a bare state dict."""
+    """The dict that torch stored at `path`, with unchecked content: a checkpoint, or a bare state dict."""
     check_is_file(path, "model file", f"modsoft-train --out {path} makes one")
     try:
-        _check_archive(path)  # torch reads old formats too, and does not look at the checksums
+        _check_archive(path)  # torch reads old formats too, and does not check the checksums
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:  # torch's own message recommends loading it with code and all
+    except pickle.UnpicklingError as error:  # torch's own message recommends loading it with its code
         raise ModelError(
             f"{path}: not a checkpoint of modsoft-train (it holds other than tensors and plain values); where it was "
             "made, save the weights alone: torch.save(network.state_dict(), FILE)"
@@ -68,8 +67,8 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def _check_archive(path: Path) -> None:
-    """`ModelError` for a zip archive that is damaged or other than torch.save writes them: one folder, nothing
-    compressed, nothing twice, no TorchScript."""
+    """`ModelError` for a zip archive that is damaged or not one of torch.save: one folder, no compression, no entry
+    twice, no TorchScript."""
     with path.open("rb") as file:
         if file.read(len(OLD_FORMAT)) == OLD_FORMAT:
             raise ModelError(
@@ -100,17 +99,17 @@ def _tensors(value: Any) -> Iterator[torch.Tensor]:
 
 
 def _fills_its_storage(tensor: torch.Tensor) -> bool:
-    """False for a tensor whose strides make it look larger than the numbers that were read for it."""
+    """False for a tensor whose strides give it more numbers than were read for it."""
     is_plain = tensor.layout == torch.strided and not tensor.is_quantized
     return is_plain and tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Reads a checkpoint; `ModelError` says what was found when it is none."""
+    """Reads a checkpoint; `ModelError` for any other file."""
     checkpoint = read(path)
     missing = [key for key in KEYS if key not in checkpoint]
     if missing:
-        raise ModelError(f"{path}: no {', '.join(missing)} in it, expected a checkpoint of modsoft-train")
+        raise ModelError(f"{path}: {', '.join(missing)} missing, expected a checkpoint of modsoft-train")
     if checkpoint["schema"] != SCHEMA:
         raise ModelError(f"{path}: schema {checkpoint['schema']}, this version reads {SCHEMA}; train it again")
     wrong = [key for key, kind in KEYS.items() if not isinstance(checkpoint[key], kind)]
@@ -123,11 +122,11 @@ def network_of(checkpoint: dict[str, Any]) -> nn.Module:
     """The network with its weights, in evaluation mode."""
     description, weights = checkpoint["network"], checkpoint["weights"]
     try:
-        with torch.device("meta"):  # takes no memory, whatever sizes the file claims
+        with torch.device("meta"):  # needs no memory, whatever sizes the file claims
             networks.build(description).load_state_dict(weights, assign=True)
         network = networks.build(description)
         network.load_state_dict(weights)
     except (RuntimeError, TypeError, ValueError, KeyError) as error:
-        told = " ".join(str(error).split())
-        raise ModelError(f"the checkpoint's weights do not fit its own description: {told}") from error
+        reason = " ".join(str(error).split())
+        raise ModelError(f"the checkpoint's weights do not fit its own description: {reason}") from error
     return network.eval()

@@ -1,4 +1,4 @@
-"""`modsoft-collect`: a data set from the simulated robot, and pictures of what data sets cover."""
+"""`modsoft-collect`: a data set of a simulated robot, and pictures of the space that data sets cover."""
 
 from __future__ import annotations
 
@@ -21,23 +21,26 @@ from modsoft.runtime.files import check_not_input, check_writable
     subcommand_metavar="[plot DATASET... --out FILE.png]",
 )
 @click.option("--robot", "robot_file", help="Robot file, or a shipped robot's name (pneumatic-3, ...).  [required]")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Data set to make (HDF5).  [required]")
-@click.option("--samples", default=15000, type=click.IntRange(1), help="Control steps at least, in all.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Data set to write (HDF5).  [required]")
+@click.option(
+    "--samples", default=15000, type=click.IntRange(1), help="Number of control steps, rounded up to whole episodes."
+)
 @click.option(
     "--strategy",
     default="staged",
     type=click.Choice(STRATEGIES),
-    help="staged: modules share one action sequence at first, fewer of them in every stage. random: each its own. "
-    "smooth: actions that wander, as tasks move. varied: the same on robots of other stiffness and payload.",
+    help="Of the random actions. staged: all modules share one sequence at first, fewer of them in every stage, as in "
+    "the paper. random: every module has its own. smooth: slow motion as in tasks. varied: smooth, on robots with "
+    "other stiffness and payload.",
 )
 @click.option("--seed", default=0, type=click.IntRange(0), help="The same seed gives the same data set.")
-@click.option("--steps", default=300, type=click.IntRange(1), help="Control steps of an episode; each starts at rest.")
+@click.option("--steps", default=300, type=click.IntRange(1), help="Control steps of an episode, which starts at rest.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes, cluster jobs or workers at a time.  [default: cores]")
 @click.option(
     "--backend",
     default="local",
     type=click.Choice(["local", "submitit", "dask"]),
-    help="local: processes here. submitit: SLURM jobs (extra slurm). dask: its workers (extra dask).",
+    help="local: processes of this machine. submitit: SLURM jobs (extra slurm). dask: its workers (extra dask).",
 )
 @click.option(
     "--backend-option",
@@ -45,8 +48,8 @@ from modsoft.runtime.files import check_not_input, check_writable
     multiple=True,
     metavar="NAME=VALUE",
     help="For submitit: slurm_partition=long, timeout_min=60, ... For dask: scheduler=ADDRESS, or cluster=SLURMCluster "
-    "and its parameters (cores=1, memory=2GB, ...); what its ports get is run, so keep them off open networks, or give "
-    "dask's TLS (security=true). May be repeated.",
+    "and its parameters (cores=1, memory=2GB, ...). dask runs all code that its ports receive: keep them off open "
+    "networks, or use its TLS (security=true). May be repeated.",
 )
 @click.option("--simulator", help="elastica, fleet-plain, fleet-avx2, ...  [default: the fastest here]")
 @renamed_option("--plant", "--simulator")
@@ -64,15 +67,15 @@ def cli(
     options: tuple[str, ...],
     simulator: str | None,
 ) -> None:
-    """Drive the simulated robot with random actions and record what it does.
+    """Apply random actions to the simulated robot and record its configurations.
 
     \b
     Example:
       modsoft-collect --robot pneumatic-3 --samples 15000 --out dataset.h5
 
-    Stopped or killed, the same command goes on where it was: whole episodes wait in OUT.parts, and the finished file
-    is the same, bit for bit, as if nothing had happened. Neither --jobs nor --backend changes a number. On a cluster
-    every worker needs the same installation and the folder of OUT. While one works on OUT, another ends with 75.
+    After an interruption, the same command resumes from the finished episodes in OUT.parts; the data set is the same,
+    bit for bit, as without the interruption. It does not depend on --jobs or --backend. On a cluster every worker needs
+    the same installation and access to the folder of OUT. While one process collects OUT, a second one exits with 75.
     """
     if context.invoked_subcommand is not None:
         return
@@ -94,22 +97,22 @@ def cli(
 
     def progress(done: int, total: int) -> None:
         nonlocal bar
-        if bar is None:  # what an earlier run left does not count into the rate
+        if bar is None:  # episodes of an earlier run do not count for the speed
             bar = tqdm(total=total, initial=done, unit=" samples", desc="collect", smoothing=0.1)
         bar.update(done - bar.n)
 
     try:
-        made = collect(robot, out, samples, strategy, seed, steps, jobs or cores(), chosen, progress, backend, given)
+        header = collect(robot, out, samples, strategy, seed, steps, jobs or cores(), chosen, progress, backend, given)
     finally:
         if bar is not None:
             bar.close()
-    lost = f"; {made.rejected} episodes diverged and were replaced" if made.rejected else ""
-    rounded = f" ({samples} rounded up to whole episodes of {steps})" if made.samples != samples else ""
-    click.echo(f"{out}: {made.samples} samples in {made.episodes} episodes{rounded}{lost}")
+    rejected = f"; {header.rejected} episodes diverged and were replaced" if header.rejected else ""
+    note = f" ({samples} rounded up to whole episodes of {steps})" if header.samples != samples else ""
+    click.echo(f"{out}: {header.samples} samples in {header.episodes} episodes{note}{rejected}")
 
 
 def _option(text: str) -> tuple[str, Any]:
-    """NAME=VALUE; a value that is JSON (a number, a list) is taken as such, any other as text."""
+    """NAME=VALUE; the value is JSON (a number, a list) or else text."""
     name, separator, value = text.partition("=")
     if not (name and separator):
         raise click.UsageError(f"--backend-option {text}: expected NAME=VALUE")
@@ -123,7 +126,7 @@ def _option(text: str) -> tuple[str, Any]:
 @click.argument("data_files", metavar="DATASET...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=click.Path(path_type=Path, dir_okay=False), help="Picture (PNG, PDF, SVG).")
 def plot(data_files: tuple[Path, ...], out: Path) -> None:
-    """Show where the module ends of data sets were, side by side, and how much space they cover.
+    """Draw the positions of the module ends in data sets, side by side, and print how much space they cover.
 
     \b
     Example:
@@ -133,9 +136,9 @@ def plot(data_files: tuple[Path, ...], out: Path) -> None:
     check_not_input(out, *data_files)
     from modsoft.training.data import coverage
 
-    found = coverage.compare(list(data_files))
-    coverage.draw(found, out)
-    for each in found:
+    coverages = coverage.compare(list(data_files))
+    coverage.draw(coverages, out)
+    for each in coverages:
         click.echo(coverage.line(each))
 
 

@@ -1,5 +1,5 @@
-"""The three networks of Table S1. All take the same features of a window and give the same actuation, so that training,
-evaluation and the control loop are the same code for each."""
+"""The three networks of Table S1. All map the features of a window to an actuation, so that training, evaluation and
+the control loop are the same for each."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ class LSTM(nn.Module):
 
 
 class ModuleLSTM(nn.Module):
-    """One network a module, each with weights of its own and told nothing of the others: the sequence is time, an
-    element of it the module's own states and actions in one slot. Bound to its number of modules.
+    """One network for each module, with its own weights and without information about the others: the sequence is
+    time, an element of it the module's own states and actions in one slot. Bound to its number of modules.
 
     Table S1 ("four LSTM"): 4 layers of hidden size 128 each. A loop over the networks: torch's fused LSTM is twice as
     fast on a processor as one batched product for all of them.

@@ -1,4 +1,4 @@
-"""Pictures that do not depend on a user's settings of matplotlib: its matplotlibrc, style, backend, LaTeX."""
+"""Pictures that do not depend on the user's settings of matplotlib: matplotlibrc, style, backend, LaTeX."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def save(draw: Callable[[], Figure], out: Path, dpi: int) -> None:
-    """Writes what `draw` returns to `out`, whole or not at all, in the format of its ending (none: PNG).
+    """Writes the figure of `draw` to `out`, completely or not at all, in the format of its suffix (none: PNG).
 
-    `UsageError` for an ending that is no format; `OutputError` where matplotlib fails, or the file cannot be written.
+    Raises `UsageError` for an unknown suffix, `OutputError` where matplotlib fails or the file cannot be written.
     """
     matplotlib = _imported()
     with matplotlib.rc_context(), written(out) as temporary:
@@ -41,7 +41,7 @@ def save(draw: Callable[[], Figure], out: Path, dpi: int) -> None:
 
 
 def figure(width_in: float, height_in: float) -> Figure:
-    """An empty one, without pyplot and so without a window."""
+    """An empty figure, without pyplot and therefore without a window."""
     _imported()
     from matplotlib.figure import Figure
 
@@ -49,14 +49,14 @@ def figure(width_in: float, height_in: float) -> Figure:
 
 
 def _imported() -> Any:
-    """matplotlib; `OutputError` where a user's file keeps it from being imported."""
+    """matplotlib; `OutputError` where a file of the user prevents the import."""
     is_first = "matplotlib" not in sys.modules
     try:
         with _without_backend() as backend:
             import matplotlib
     except ImportError:
         raise
-    except Exception as error:  # of a file's encoding, for instance
+    except Exception as error:  # for instance of the encoding of a file
         raise OutputError(f"no picture: matplotlib does not start ({_one_line(error)})") from error
     if is_first and backend is not None:  # for the user's own figures, in a program that uses modsoft as a library
         with contextlib.suppress(ValueError, ImportError):
@@ -66,7 +66,7 @@ def _imported() -> Any:
 
 @contextlib.contextmanager
 def _without_backend() -> Iterator[str | None]:
-    """A notebook gives its backend to the commands that it starts, where it need not be installed."""
+    """Without MPLBACKEND: commands inherit it from a notebook, and its backend may not be installed for them."""
     backend = os.environ.pop("MPLBACKEND", None)
     try:
         yield backend

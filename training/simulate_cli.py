@@ -1,4 +1,4 @@
-"""`modsoft-simulate`: an action sequence applied to the simulated robot from rest."""
+"""`modsoft-simulate`: applies a sequence of actions to the simulated robot from rest."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from modsoft.training.simulation.rollout import rollout
 
 
 def read_actions(path: str, robot: Robot) -> Array:
-    """Actions (steps, N, A) in [-1, 1] from a .npy file; `ModelError` (65) where it is anything else."""
-    wanted = f"(steps, {robot.modules}, {robot.action_size}) for {robot.name}"
+    """Actions (steps, N, A) in [-1, 1] from a .npy file; `ModelError` for any other file."""
+    expected = f"(steps, {robot.modules}, {robot.action_size}) for {robot.name}"
     try:
         actions = np.load(path, allow_pickle=False)
     except FileNotFoundError as error:
-        raise ModelError(f"{path}: no such file; expected a .npy array {wanted}") from error
-    except (OSError, *NOT_AN_ARRAY) as error:  # numpy's own words recommend loading it unsafely
-        why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged, or another format"
-        raise ModelError(f"{path}: not a .npy array of numbers ({why}); expected {wanted}") from error
+        raise ModelError(f"{path}: no such file; expected a .npy array {expected}") from error
+    except (OSError, *NOT_AN_ARRAY) as error:  # numpy's own message recommends unsafe loading
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else "damaged, or another format"
+        raise ModelError(f"{path}: not a .npy array of numbers ({reason}); expected {expected}") from error
     if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiu":
-        raise ModelError(f"{path}: found no array of numbers; expected {wanted}")
+        raise ModelError(f"{path}: found no array of numbers; expected {expected}")
     if actions.ndim != 3 or actions.shape[1:] != (robot.modules, robot.action_size) or not len(actions):
-        raise ModelError(f"{path}: found shape {actions.shape}, expected {wanted}")
+        raise ModelError(f"{path}: found shape {actions.shape}, expected {expected}")
     wrong = np.argwhere(~(np.abs(actions) <= 1.0))  # NaN is wrong too
     if len(wrong):
         step, module, action = (int(i) for i in wrong[0])
@@ -60,7 +60,7 @@ def simulate(robot: Robot, actions: Array) -> dict[str, Array]:
 
 
 def write(path: str, run: dict[str, Array]) -> None:
-    """Writes the arrays to `path` as it is, all of them or none."""
+    """Writes the arrays to exactly `path`, all of them or none."""
     with written(Path(path)) as part, part.open("wb") as file:
         np.savez(file, allow_pickle=False, **run)
 
@@ -70,10 +70,10 @@ def write(path: str, run: dict[str, Array]) -> None:
 @click.option("--actions", required=True, metavar="FILE", help=".npy array (steps, modules, actions) in [-1, 1].")
 @click.option("--out", required=True, metavar="FILE", help=".npz to write.")
 def command(robot_file: str, actions: str, out: str) -> None:
-    """Apply a sequence of actions, one a control period, to the simulated robot from rest.
+    """Apply a sequence of actions, one in each control period, to the simulated robot from rest.
 
-    --out gets configuration (steps + 1, modules, 3), that is [v_x, v_y, v_z], positions (steps + 1, modules, 3) in
-    metres and directors (steps + 1, modules, 3, 3) with rows d1, d2, d3; row 0 is the robot at rest.
+    OUT contains the arrays configuration (steps + 1, modules, 3), that is [v_x, v_y, v_z]; positions (steps + 1,
+    modules, 3), m; and directors (steps + 1, modules, 3, 3), rows d1, d2, d3. Row 0 is the robot at rest.
     """
     check_writable(Path(out))
     check_not_input(Path(out), Path(actions), Path(robot_file))

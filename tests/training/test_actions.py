@@ -1,4 +1,4 @@
-"""The actions that data are collected with."""
+"""Random actions for the collection of data."""
 
 import itertools
 
@@ -18,7 +18,7 @@ def draw(robot, strategy, steps, seed=0):
 
 
 @given(st.integers(2, 8), st.integers(1, 300), st.sampled_from([0.1, 0.4, 1.9, 2.0]), st.integers(0, 99))
-def test_staged_actions_are_alike_in_the_first_modules_of_each_stage(modules, steps, largest, seed):
+def test_first_modules_of_each_stage_share_their_actions(modules, steps, largest, seed):
     actions = draw(of_modules("cable", modules, largest), "staged", steps, seed)
     assert actions.shape == (steps, modules, 2)
     assert np.all(np.abs(actions) <= 1.0)
@@ -27,15 +27,15 @@ def test_staged_actions_are_alike_in_the_first_modules_of_each_stage(modules, st
     assert np.ptp(np.diff(borders)) <= 1
     for stage, (begin, end) in enumerate(itertools.pairwise(borders)):
         piece = actions[begin:end]
-        alike = modules - stage
-        assert np.array_equal(piece[:, :alike], np.repeat(piece[:, :1], alike, axis=1))
-        for module in range(alike, modules):
+        shared = modules - stage
+        assert np.array_equal(piece[:, :shared], np.repeat(piece[:, :1], shared, axis=1))
+        for module in range(shared, modules):
             for other in range(module):
                 assert not np.any(piece[:, module] == piece[:, other])
 
 
 @given(st.integers(2, 5), st.sampled_from([0.05, 0.4, 1.0]), st.sampled_from(STRATEGIES), st.integers(0, 99))
-def test_the_loop_would_send_every_drawn_action_as_it_is(modules, largest, strategy, seed):
+def test_actions_are_within_the_limits_of_the_control_loop(modules, largest, strategy, seed):
     actions = draw(of_modules("cable", modules, largest), strategy, 200, seed)
     previous = np.zeros_like(actions[0])  # every episode starts with the actuation at rest
     for action in actions:
@@ -55,7 +55,7 @@ def test_unbounded_actions_are_uniform():
 
 
 @given(st.floats(0.01, 1.9))
-def test_a_reflected_walk_keeps_a_uniform_distribution_whatever_its_step(largest):
+def test_reflected_walk_keeps_a_uniform_distribution_at_any_step(largest):
     rng = np.random.default_rng(0)
     increments = rng.uniform(-largest, largest, (5, 20000))
     increments[0] = rng.uniform(-1, 1, 20000)  # walkers all over the range
@@ -82,12 +82,12 @@ def test_random_actions_differ_between_modules_and_change_slowly_and_fast():
 
 
 @pytest.mark.parametrize("strategy", ["smooth", "varied"])
-def test_smooth_actions_wander_over_the_whole_range_and_jitter(strategy):
+def test_smooth_actions_cover_the_whole_range_with_jitter(strategy):
     robot = of_modules("cable", 4)
     drawn = np.stack([draw(robot, strategy, 300, seed) for seed in range(60)])
     assert np.all(np.abs(drawn) <= 1.0)
     steps = np.abs(np.diff(drawn, axis=1))
-    assert np.median(steps) < 0.1  # 0.59 where every action is drawn anew
+    assert np.median(steps) < 0.1  # 0.59 where every action is independent
     for module in range(4):
         found = shares(drawn[:, :, module])
         assert found.min() > 0.02
@@ -96,11 +96,11 @@ def test_smooth_actions_wander_over_the_whole_range_and_jitter(strategy):
     assert 0.05 < np.mean(begins_at_rest) < 0.95  # the others jump
 
 
-def test_some_modules_move_together():
-    """The pull of a neighbour shows when both go the same way, as all do in a task."""
+def test_some_modules_share_a_smooth_sequence():
+    """The effect of a neighbour is largest when both move in the same direction, as in tasks."""
     robot = of_modules("cable", 4)
-    alike = []
+    correlations = []
     for seed in range(60):
         drawn = draw(robot, "smooth", 300, seed)[..., 0]
-        alike.append(abs(np.corrcoef(drawn[:, 0], drawn[:, 1])[0, 1]))
-    assert 0.1 < np.mean(np.array(alike) > 0.9) < 0.7
+        correlations.append(abs(np.corrcoef(drawn[:, 0], drawn[:, 1])[0, 1]))
+    assert 0.1 < np.mean(np.array(correlations) > 0.9) < 0.7

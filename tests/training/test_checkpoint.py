@@ -1,4 +1,4 @@
-"""A checkpoint file is read whole and sound, or refused in one line."""
+"""A checkpoint file is valid, or refused in one line."""
 
 import random
 
@@ -9,7 +9,7 @@ from modsoft.runtime.errors import ModelError
 from modsoft.training import checkpoint as checkpoints
 
 
-def spoilt(sound, generator):
+def corrupted(sound, generator):
     content = bytearray(sound)
     at = generator.randrange(len(content))
     match generator.randrange(4):
@@ -24,12 +24,12 @@ def spoilt(sound, generator):
     return bytes(content)
 
 
-def test_a_damaged_file_never_gives_other_values(tmp_path, make_checkpoint):
-    """Refused, or, where the damage hit only the archive's padding, the same to the last bit."""
+def test_damaged_file_never_gives_other_values(tmp_path, make_checkpoint):
+    """It is refused or, with damage only in the padding of the archive, equal."""
     path = make_checkpoint(tmp_path / "model.pt")
     sound, expected, generator, refused = path.read_bytes(), checkpoints.load(path), random.Random(0), 0
     for _ in range(300):
-        path.write_bytes(spoilt(sound, generator))
+        path.write_bytes(corrupted(sound, generator))
         try:
             found = checkpoints.load(path)
         except ModelError:
@@ -43,7 +43,7 @@ def test_a_damaged_file_never_gives_other_values(tmp_path, make_checkpoint):
 
 
 @pytest.mark.parametrize("content", [b"", b"j", b"jun", b"junk", b"PK\x03\x04", b"[robot]\n", bytes(600)])
-def test_other_files(tmp_path, content):
+def test_other_files_are_refused(tmp_path, content):
     (tmp_path / "model.pt").write_bytes(content)
     with pytest.raises(ModelError, match=r"^[^\n]*not a checkpoint[^\n]*$"):
         checkpoints.load(tmp_path / "model.pt")

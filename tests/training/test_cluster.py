@@ -164,7 +164,7 @@ def test_jobs_make_the_same_data_set(slurm, tmp_path, straight):
     assert "sacct" not in found.stderr  # which cannot work here, and would say so in the middle of the progress
 
 
-def test_a_killed_collection_goes_on_from_what_its_jobs_have_made(slurm, tmp_path):
+def test_killed_collection_resumes_from_the_episodes_of_its_jobs(slurm, tmp_path):
     """SIGKILL to modsoft-collect, which leaves its jobs in the queue, and another start while they run."""
     given = {"samples": 96000}
     assert run(tmp_path, "straight.h5", **given).returncode == 0
@@ -185,7 +185,7 @@ def test_a_killed_collection_goes_on_from_what_its_jobs_have_made(slurm, tmp_pat
     assert dataset.read_header(tmp_path / "d.h5").episodes == 480
 
 
-def test_a_cancelled_job_is_told_and_the_next_run_goes_on(slurm, tmp_path):
+def test_cancelled_job_is_reported_and_the_next_run_resumes(slurm, tmp_path):
     given = {"samples": 96000}
     assert run(tmp_path, "straight.h5", **given).returncode == 0
     collecting = subprocess.Popen(
@@ -194,9 +194,9 @@ def test_a_cancelled_job_is_told_and_the_next_run_goes_on(slurm, tmp_path):
     eventually(running_jobs, "a job runs", among=(collecting,))
     lost = running_jobs()[0]
     subprocess.run(["scancel", lost], check=True)
-    told = collecting.communicate(timeout=180)[1].splitlines()[-1]
+    message = collecting.communicate(timeout=180)[1].splitlines()[-1]
     assert collecting.returncode == 70
-    assert f"job {lost} was lost" in told
+    assert f"job {lost} was lost" in message
     eventually(lambda: not queued(), "its other jobs are cancelled too")
     again = run(tmp_path, "d.h5", "--backend", "submitit", **given)
     assert again.returncode == 0, again.stderr

@@ -1,4 +1,4 @@
-"""Collection that survives being killed."""
+"""Collection of data sets, resumed after a kill."""
 
 import json
 import subprocess
@@ -51,7 +51,7 @@ def test_episode_depends_on_seed_and_index_alone():
     assert not np.array_equal(one[1], with_other_seed[1])
 
 
-def test_a_data_set_carries_its_generation_and_reads_back(tmp_path):
+def test_data_set_contains_its_generation_settings(tmp_path):
     robot = of_modules("pneumatic", 3, 0.4)
     out = tmp_path / "d.h5"
     seen = []
@@ -72,32 +72,32 @@ def test_a_data_set_carries_its_generation_and_reads_back(tmp_path):
         assert set(file.attrs) == {"schema", "generation", "stage_borders", "rejected"}
 
 
-@pytest.mark.parametrize("together", [1, 3])
-def test_an_episode_that_is_not_finite_is_drawn_again_and_counted(tmp_path, together):
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_diverged_episode_is_rejected_and_counted(tmp_path, batch_size):
     robot = of_modules("pneumatic", 2)
-    lost = []
+    rejected = []
 
-    def sometimes_lost(robot, actions):
-        """Loses every robot whose first action is above 0.5."""
+    def sometimes_diverging(robot, actions):
+        """Every robot with a first action above 0.5 diverges."""
         configuration = simulate(robot, actions)
         for i in np.flatnonzero(actions[:, 0, 0, 0] > 0.5):
             configuration[i, 5:, 1] = np.nan
-            lost.append(actions[i])
+            rejected.append(actions[i])
         return configuration
 
-    c.collect(robot, tmp_path / "d.h5", 120, "random", 0, 10, simulator=simulator(sometimes_lost, together))
+    c.collect(robot, tmp_path / "d.h5", 120, "random", 0, 10, simulator=simulator(sometimes_diverging, batch_size))
     data = dataset.read(tmp_path / "d.h5")
-    assert data.rejected == len(lost) > 2
+    assert data.rejected == len(rejected) > 2
     assert np.all(data.action[:, 0, 0, 0] <= 0.5)
     np.testing.assert_array_equal(data.configuration, simulate(robot, data.action))
 
 
-def test_a_robot_that_is_always_lost_ends_in_an_error(tmp_path):
-    def always_lost(robot, actions):
+def test_robot_that_always_diverges_is_an_error(tmp_path):
+    def always_diverging(robot, actions):
         return np.full_like(simulate(robot, actions), np.inf)
 
     with pytest.raises(ModelError, match="episode 0: not finite 10 times"):
-        c.collect(of_modules("pneumatic", 2), tmp_path / "d.h5", 10, simulator=simulator(always_lost))
+        c.collect(of_modules("pneumatic", 2), tmp_path / "d.h5", 10, simulator=simulator(always_diverging))
 
 
 def parts_of_one_episode(tmp_path) -> Path:
@@ -124,7 +124,7 @@ def parts_of_one_episode(tmp_path) -> Path:
     ],
 )
 @pytest.mark.parametrize("finished", [False, True])
-def test_another_recipe_is_refused_and_nothing_is_touched(tmp_path, change, message, finished):
+def test_other_generation_settings_are_refused_and_nothing_changes(tmp_path, change, message, finished):
     out = parts_of_one_episode(tmp_path)
     asked = {"robot": of_modules("pneumatic", 3, 0.4), "strategy": "staged", "seed": 1, "steps": 30}
     if finished:
@@ -140,7 +140,7 @@ def cut(shard: Path) -> None:
 
 
 def poison(shard: Path) -> None:
-    """Plants a value that is not finite."""
+    """Writes a value that is not finite."""
     with np.load(shard) as file:
         arrays = dict(file)
     arrays["configuration"][7, 1, 2] = np.inf
@@ -148,7 +148,7 @@ def poison(shard: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [cut, poison])
-def test_a_damaged_episode_is_made_again(tmp_path, damage):
+def test_damaged_episode_is_replaced(tmp_path, damage):
     out = parts_of_one_episode(tmp_path)
     shard = out.with_name("d.h5.parts") / "episode-000000.npz"
     damage(shard)
@@ -158,7 +158,7 @@ def test_a_damaged_episode_is_made_again(tmp_path, damage):
     np.testing.assert_array_equal(data.action[0], c.episodes(data.generation, robot, [0], simulate)[0][1])
 
 
-def test_a_finished_data_set_is_not_made_again(tmp_path):
+def test_finished_data_set_is_kept(tmp_path):
     robot, out = of_modules("pneumatic", 2), tmp_path / "d.h5"
     c.collect(robot, out, 20, "random", 0, 10, simulator=simulator())
     written = out.stat().st_mtime_ns
@@ -173,7 +173,7 @@ def test_a_finished_data_set_is_not_made_again(tmp_path):
 
 
 @pytest.mark.parametrize("kept", ["d.h5.parts", ".d.h5.parts.host.12.tmp"])
-def test_what_a_kill_at_the_very_end_left_is_cleared_away(tmp_path, kept):
+def test_files_after_a_kill_at_the_end_are_deleted(tmp_path, kept):
     out = parts_of_one_episode(tmp_path)
     robot = of_modules("pneumatic", 3, 0.4)
     c.collect(robot, out, 60, "staged", 1, 30, simulator=simulator())
@@ -184,7 +184,7 @@ def test_what_a_kill_at_the_very_end_left_is_cleared_away(tmp_path, kept):
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_an_episode_that_is_not_finite_does_not_pass_the_last_door(tmp_path):
+def test_join_refuses_an_episode_that_is_not_finite(tmp_path):
     good = c.episodes(
         c.generation_settings(of_modules("pneumatic", 2), "random", 0, 10, "p"),
         of_modules("pneumatic", 2),
@@ -197,7 +197,7 @@ def test_an_episode_that_is_not_finite_does_not_pass_the_last_door(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_through_a_link_everything_goes_to_its_target(tmp_path):
+def test_all_files_are_written_beside_the_target_of_a_link(tmp_path):
     home, disk = tmp_path / "home", tmp_path / "disk"
     home.mkdir()
     disk.mkdir()
@@ -214,7 +214,7 @@ def test_through_a_link_everything_goes_to_its_target(tmp_path):
     assert (home / "data.h5").is_symlink()
 
 
-def test_a_folder_that_is_not_there_is_a_usage_error(tmp_path):
+def test_missing_folder_is_a_usage_error(tmp_path):
     with pytest.raises(UsageError, match="no folder"):
         c.collect(of_modules("pneumatic", 2), tmp_path / "none" / "d.h5", 10, simulator=simulator())
 
@@ -251,7 +251,7 @@ def start_collection(folder: Path, jobs: int, delay_s: float) -> subprocess.Pope
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_killed_and_started_again_gives_the_same_file_bit_for_bit(tmp_path, jobs):
+def test_killed_collection_gives_the_same_file_bit_for_bit(tmp_path, jobs):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()
     killed.mkdir()
@@ -278,7 +278,7 @@ def test_killed_and_started_again_gives_the_same_file_bit_for_bit(tmp_path, jobs
     ]
 
 
-def test_an_error_in_a_worker_ends_the_command_with_its_own_message(tmp_path):
+def test_error_in_a_worker_ends_the_command_with_its_own_message(tmp_path):
     (tmp_path / "stand_in.py").write_text(
         "from modsoft.runtime.errors import ModelError\n"
         "def simulate(robot, actions):\n"
@@ -322,7 +322,7 @@ def test_memory_does_not_grow_with_the_number_of_samples(tmp_path):
     assert peaks_mib[1] - peaks_mib[0] < 5
 
 
-def test_the_robots_of_a_varied_data_set_differ_from_the_drawing_eight_episodes_alike():
+def test_varied_data_have_another_perturbed_robot_every_eight_episodes():
     robot = robots.load("cable-4")
     generation = c.generation_settings(robot, "varied", 5, 30, "stand-in")
     found = [c.perturbation_of(generation, robot, index) for index in range(400)]
@@ -339,7 +339,7 @@ def test_the_robots_of_a_varied_data_set_differ_from_the_drawing_eight_episodes_
     assert c.perturbation_of(c.generation_settings(robot, "smooth", 5, 30, "stand-in"), robot, 0) == NOMINAL
 
 
-def test_an_episode_is_simulated_on_its_own_robot_whatever_is_asked_for_with_it():
+def test_episode_is_simulated_on_its_own_robot_in_any_batch():
     robot = robots.load("cable-4")
     generation = c.generation_settings(robot, "varied", 5, 6, "stand-in")
 

@@ -16,7 +16,7 @@ from modsoft.training.data import actions, coverage, dataset
 from modsoft.training.simulation.elastica import Arm
 
 
-def test_a_straight_robot_stands_on_its_axis():
+def test_straight_robot_is_on_its_axis():
     ends = coverage.module_ends(from_angles_deg(np.zeros((1, 3))), 0.05)
     np.testing.assert_allclose(ends[0], [[0, 0, 0.05], [0, 0, 0.10], [0, 0, 0.15]], atol=1e-15)
 
@@ -28,7 +28,7 @@ def test_quarter_circles():
     np.testing.assert_allclose(opposite, [[radius, 0, radius], [2 * radius, 0, 2 * radius]], atol=1e-12)
 
 
-def test_out_of_the_plane_a_module_is_turned_with_the_one_before():
+def test_module_is_rotated_with_the_previous_one():
     toward_y = np.array([0.0, 1.0, 0.0])
     radius = 0.05 * 2 / np.pi
     ends = coverage.module_ends(np.stack([toward_y, [1.0, 0.0, 0.0]]), 0.05)
@@ -37,7 +37,7 @@ def test_out_of_the_plane_a_module_is_turned_with_the_one_before():
 
 
 @pytest.mark.parametrize(("name", "farthest_m"), [("pneumatic-3", 0.010), ("cable-4", 0.030)])
-def test_the_arcs_follow_the_simulated_robot(name, farthest_m):
+def test_arcs_are_close_to_the_simulated_robot(name, farthest_m):
     robot = robots.load(name)
     arm = Arm(robot.kind, robot.modules)
     arm.step(np.full((robot.modules, robot.action_size), 0.4), 0.4)
@@ -79,14 +79,14 @@ def test_staged_data_cover_more_of_the_tips_space_than_random(tmp_path):
     assert [len(each.positions) for each in found] == [3000, 3000]  # of the smaller
 
 
-def test_robots_that_cannot_be_compared_are_refused(tmp_path):
+def test_data_sets_of_different_robots_are_refused(tmp_path):
     write(tmp_path / "a.h5", "cable-4", "staged", 1)
     write(tmp_path / "b.h5", "pneumatic-3", "staged", 1)
     with pytest.raises(ModelError, match="cable with 4 modules, pneumatic with 3 modules"):
         coverage.compare([tmp_path / "a.h5", tmp_path / "b.h5"])
 
 
-def test_the_command_draws_and_tells(tmp_path):
+def test_command_draws_and_prints(tmp_path):
     write(tmp_path / "s.h5", "pneumatic-3", "staged", 2)
     write(tmp_path / "r.h5", "pneumatic-3", "random", 2)
     command = [sys.executable, "-m", "modsoft.training.collect_cli", "plot", "s.h5", "r.h5", "--out", "w.png"]
@@ -98,7 +98,7 @@ def test_the_command_draws_and_tells(tmp_path):
     assert (tmp_path / "w.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_picture_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_picture_is_written_completely_or_not_at_all(tmp_path, monkeypatch):
     write(tmp_path / "s.h5", "pneumatic-3", "staged", 2)
     found = coverage.compare([tmp_path / "s.h5"])
     for name, says in (("none/w.png", "no folder"), ("w.txt", "cannot be written"), ("w.tmp", "cannot be written")):

@@ -30,7 +30,7 @@ def steps_of(windows: d.Windows, data: d.DataSet) -> set[tuple[int, int]]:
     return {place[target.tobytes()] for target in windows.targets}
 
 
-def test_same_data_same_bytes(tmp_path):
+def test_same_data_give_the_same_bytes(tmp_path):
     data = make(2, 30)
     d.write(data, tmp_path / "a.h5")
     d.write(data, tmp_path / "b.h5")
@@ -39,14 +39,14 @@ def test_same_data_same_bytes(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.h5", "b.h5"]
 
 
-def test_one_number_makes_another_sha256():
+def test_sha256_depends_on_every_number():
     data, other = make(2, 30), make(2, 30)
     assert data.sha256() == other.sha256()
     other.action[1, 3, 0, 0] += 1e-12
     assert data.sha256() != other.sha256()
 
 
-def test_what_is_no_data_set_is_refused(tmp_path):
+def test_other_files_are_refused(tmp_path):
     path = tmp_path / "d.h5"
     with pytest.raises(ModelError, match=r"no data set .*modsoft-collect"):
         d.read(path)
@@ -73,7 +73,7 @@ def test_wrong_shapes_and_values_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["pneumatic-3", "cable-4"])
-def test_windows_are_what_the_loop_would_have_seen(kind):
+def test_windows_equal_those_of_the_control_loop(kind):
     data = make(1, 240, kind)
     history = 5
     training, _, _ = d.split(data, history, "blocks", 0)
@@ -110,7 +110,7 @@ def test_whole_episodes_lose_no_window():
     assert sum(len(windows) for windows in d.split(data, 10, "blocks", 0)) == data.samples
 
 
-def test_the_shuffled_split_deals_single_windows():
+def test_shuffled_split_assigns_single_windows():
     data = make(3, 100)
     parts = [steps_of(windows, data) for windows in d.split(data, 10, "shuffled", 0)]
     assert [len(part) for part in parts] == [210, 30, 60]

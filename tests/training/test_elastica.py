@@ -1,4 +1,4 @@
-"""The robots in PyElastica: the authors' recorded runs, a stored trace of our own, and what the arm refuses."""
+"""The robots in PyElastica: against the authors' recorded runs and stored traces; invalid arguments."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DATA = Path(__file__).parent / "data"
 
 
 @pytest.mark.parametrize("task", ["a", "b", "c"])
-def test_the_recorded_actions_give_the_recorded_configurations(task):
+def test_recorded_actions_give_the_recorded_configurations(task):
     path = REFERENCE / f"four_module_bilstm_task_{task}.npz"
     if not path.is_file():
         pytest.skip("the authors' recorded runs are not part of this repository")
@@ -37,8 +37,8 @@ def test_the_recorded_actions_give_the_recorded_configurations(task):
 
 
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
-def test_the_robots_repeat_their_stored_traces(kind):
-    """Stored from this very plant: whatever changes its numbers on purpose stores them anew."""
+def test_robots_repeat_their_stored_traces(kind):
+    """Stored from this simulation: store them again after an intended change of its numbers."""
     with np.load(DATA / f"{kind}-3.npz") as trace:
         arm = Arm(kind, 3)
         for action, configuration, positions in zip(
@@ -48,7 +48,7 @@ def test_the_robots_repeat_their_stored_traces(kind):
             assert np.abs(arm.positions - positions).max() < 1e-10
 
 
-def test_cables_do_not_fight_gravity_at_rest():
+def test_cables_have_no_stress_at_rest():
     """Without actuation the cable robot only stretches, along its axis."""
     arm = Arm("cable", 2)
     arm.step(np.zeros((2, 2)))
@@ -69,7 +69,7 @@ def _pneumatic():
 
 
 @pytest.mark.parametrize(("modules", "reach_deg"), [(3, [6.0, 36.5, 93.7]), (2, [35.4, 93.7])])
-def test_the_pneumatic_modules_reach_their_angles(pneumatic, modules, reach_deg):
+def test_pneumatic_modules_reach_their_angles(pneumatic, modules, reach_deg):
     """Section 3.3: below 6, about 36 and about 90 degrees; two modules about 30 (32.4 in a task) and 75 or more."""
     arm = pneumatic[modules]
     for module in range(modules):
@@ -82,7 +82,7 @@ def test_the_pneumatic_modules_reach_their_angles(pneumatic, modules, reach_deg)
 
 
 @pytest.mark.parametrize(("modules", "angles_deg"), [(n, task[n]) for n in (3, 2) for task in (EDGE_DEG, DOWN_DEG)])
-def test_the_farthest_poses_of_the_tasks_are_within_reach(pneumatic, modules, angles_deg):
+def test_farthest_poses_of_the_tasks_are_within_reach(pneumatic, modules, angles_deg):
     """A plain integrator on each module's angle finds an actuation below full pressure that holds the pose."""
     arm = pneumatic[modules]
     arm.reset()
@@ -97,7 +97,7 @@ def test_the_farthest_poses_of_the_tasks_are_within_reach(pneumatic, modules, an
     assert np.abs(actuation).max() < 0.99
 
 
-def test_the_pneumatic_robot_settles_within_two_control_periods(pneumatic):
+def test_pneumatic_robot_settles_within_two_control_periods(pneumatic):
     arm = pneumatic[3]
     arm.reset()
     first = settled_deg(arm, [1.0, -1.0, 1.0], periods=1)
@@ -107,9 +107,9 @@ def test_the_pneumatic_robot_settles_within_two_control_periods(pneumatic):
     assert np.abs(second - last).max() < 0.1
 
 
-def test_the_pneumatic_robot_has_hysteresis(pneumatic):
-    """The same pressures hold another angle on the way up than on the way down, and the way there is forgotten only
-    at the next reversal."""
+def test_pneumatic_robot_has_hysteresis(pneumatic):
+    """The same pressures hold another angle on the way up than on the way down, and the
+    difference remains until the next reversal."""
     arm = pneumatic[3]
     arm.reset()
     tip = np.array([0.0, 0.0, 1.0])
@@ -124,7 +124,7 @@ def test_the_pneumatic_robot_has_hysteresis(pneumatic):
     assert settled_deg(arm, 0.0 * tip, periods=20)[2] == pytest.approx(held, abs=0.01)  # it does not creep away
 
 
-def test_the_pneumatic_robot_stays_in_its_plane(pneumatic):
+def test_pneumatic_robot_stays_in_its_plane(pneumatic):
     arm = pneumatic[3]
     arm.reset()
     for action in np.random.default_rng(5).uniform(-1.0, 1.0, (10, 3, 1)):
@@ -208,7 +208,7 @@ def test_a_state_that_is_not_finite_is_one_clear_error(monkeypatch):
         arm.step(np.ones((2, 2)), 5.0)
 
 
-def test_what_does_not_fit_is_refused(pneumatic):
+def test_invalid_arguments_are_refused(pneumatic):
     arm = pneumatic[2]
     with pytest.raises(ValueError, match=r"found shape \(3, 1\), expected \(2, 1\)"):
         arm.step(np.zeros((3, 1)))

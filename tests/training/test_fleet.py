@@ -1,4 +1,4 @@
-"""The fast plant against PyElastica, against the recorded runs, and against itself in other places of a batch."""
+"""The fleet against PyElastica, against the recorded runs, and against itself at other positions in a batch."""
 
 import json
 from pathlib import Path
@@ -81,7 +81,7 @@ def test_equals_pyelastica_for_other_module_numbers(kind, modules, periods):
         ("pneumatic", 3, 10, [1.1, 0.9, 1.1], 0.1),
     ],
 )
-def test_robots_off_the_drawing_equal_pyelastica_too(kind, modules, periods, stiffness, payload_modules):
+def test_perturbed_robots_equal_pyelastica(kind, modules, periods, stiffness, payload_modules):
     changed = Perturbation(stiffness, payload_modules * PARAMETERS[kind].module_kg)
     drawn = actions(kind, periods, 1, modules, seed=modules)
     robots = configurations(Fleet(kind, modules, 1, damping="explicit", perturbation=changed), drawn)[:, 0]
@@ -91,8 +91,8 @@ def test_robots_off_the_drawing_equal_pyelastica_too(kind, modules, periods, sti
 
 
 @needs_kernel
-def test_a_softer_module_bends_further_and_the_others_much_as_before():
-    """Held until the robot stands still, nearly: the couple of the cables is the same."""
+def test_softer_module_bends_further_and_the_others_hardly_change():
+    """Nearly at rest the couple of the cables is the same."""
     drawn = np.broadcast_to([[0.3, 0.0]] * 3, (20, 1, 3, 2))
     stiff, soft = (
         configurations(Fleet("cable", 3, 1), drawn),
@@ -106,7 +106,7 @@ def test_a_softer_module_bends_further_and_the_others_much_as_before():
 @needs_kernel
 @pytest.mark.parametrize("modules", [4, 6, 12])
 @pytest.mark.parametrize("factor", [0.9, 1.1])
-def test_robots_off_the_drawing_stay_whole_under_full_range_jumps(modules, factor):
+def test_perturbed_robots_stay_finite_under_full_range_jumps(modules, factor):
     drawn = np.random.default_rng(modules).choice([-1.0, 1.0], (3, 16, modules, 2))
     robots = Fleet("cable", modules, 16, perturbation=Perturbation([factor] * modules, PARAMETERS["cable"].module_kg))
     configurations(robots, drawn)
@@ -123,7 +123,7 @@ def test_robots_off_the_drawing_stay_whole_under_full_range_jumps(modules, facto
         Perturbation(tip_payload_kg=np.nan),
     ],
 )
-def test_stiffness_and_payload_of_no_robot_are_refused(changed):
+def test_invalid_stiffness_and_payload_are_refused(changed):
     makers = [Arm] if fleet_kernel.library() is None else [Arm, lambda *given, **more: Fleet(*given, 1, **more)]
     for make in makers:
         with pytest.raises(ValueError, match=r"expected 3 positive numbers|expected 0 or more"):
@@ -156,7 +156,7 @@ def test_exponential_damping_stays_close_to_the_recorded_runs(recorded):
 
 @needs_kernel
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
-def test_numbers_do_not_depend_on_place_or_company(kind):
+def test_numbers_do_not_depend_on_the_other_robots(kind):
     drawn = actions(kind, 2, 19, 3, seed=1)
     together = configurations(Fleet(kind, 3, 19), drawn)
     assert np.array_equal(together[:, 5:6], configurations(Fleet(kind, 3, 1), drawn[:, 5:6]))
@@ -175,25 +175,25 @@ def test_variants_agree(kind):
 
 @needs_kernel
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
-def test_a_lost_robot_is_reported_and_the_others_are_untouched(kind):
+def test_diverged_robot_is_reported_and_the_others_are_unchanged(kind):
     drawn = actions(kind, 3, 10, 2, seed=4)
     whole = configurations(Fleet(kind, 2, 10), drawn)
     robots = Fleet(kind, 2, 10)
     before = configurations(robots, drawn[:1])
     robots._state[:, 5, 3, 3] = np.inf  # the velocity of one node of robot 3 and of those in its lane in other blocks
-    lost = np.arange(10) % robots.lanes == 3
+    diverged = np.arange(10) % robots.lanes == 3
     run = np.concatenate([before, configurations(robots, drawn[1:])[1:]])
-    assert np.array_equal(robots.alive, ~lost)
-    assert np.array_equal(run[:, ~lost], whole[:, ~lost])
-    assert np.isnan(run[2:, lost]).any(axis=(2, 3)).all()
-    robots.reset(np.flatnonzero(lost))
+    assert np.array_equal(robots.alive, ~diverged)
+    assert np.array_equal(run[:, ~diverged], whole[:, ~diverged])
+    assert np.isnan(run[2:, diverged]).any(axis=(2, 3)).all()
+    robots.reset(np.flatnonzero(diverged))
     assert robots.alive.all()
-    assert np.array_equal(robots.configuration[lost], run[0, lost])
-    assert np.array_equal(robots.configuration[~lost], whole[-1, ~lost])
+    assert np.array_equal(robots.configuration[diverged], run[0, diverged])
+    assert np.array_equal(robots.configuration[~diverged], whole[-1, ~diverged])
 
 
 @needs_kernel
-def test_reset_begins_the_same_run_again():
+def test_run_after_reset_is_the_same():
     drawn = actions("pneumatic", 3, 4, 2, seed=5)
     robots = Fleet("pneumatic", 2, 4)
     first = configurations(robots, drawn)
@@ -203,7 +203,7 @@ def test_reset_begins_the_same_run_again():
 
 @needs_kernel
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
-def test_a_snapshot_goes_on_where_it_was_taken(kind):
+def test_run_continues_from_a_snapshot(kind):
     drawn = actions(kind, 4, 11, 2, seed=8)
     robots = Fleet(kind, 2, 11)
     configurations(robots, drawn[:2])
@@ -220,8 +220,8 @@ def test_a_snapshot_goes_on_where_it_was_taken(kind):
 
 
 @needs_kernel
-def test_exponential_damping_keeps_what_explicit_damping_loses():
-    """Full-range first actions on twelve modules: PyElastica's explicit damping loses some of them too."""
+def test_exponential_damping_is_stable_where_explicit_damping_diverges():
+    """Full-range first actions on twelve modules: PyElastica's explicit damping diverges too."""
     drawn = actions("cable", 1, 16, 12, seed=6)
     explicit, exponential = Fleet("cable", 12, 16, damping="explicit"), Fleet("cable", 12, 16)
     configurations(explicit, drawn)
@@ -231,7 +231,7 @@ def test_exponential_damping_keeps_what_explicit_damping_loses():
 
 
 @needs_kernel
-def test_a_bend_sharper_than_the_series_hold_for_is_a_loss():
+def test_curvature_beyond_the_range_of_the_series_is_a_divergence():
     robots = Fleet("cable", 2, 2)
     angle = 0.6
     turned = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
@@ -257,7 +257,7 @@ def test_wrong_shapes_and_periods_are_refused():
 
 @needs_kernel
 @pytest.mark.parametrize("limit", fleet_kernel.VARIANTS)
-def test_the_environment_limits_the_variant(monkeypatch, limit):
+def test_environment_limits_the_variant(monkeypatch, limit):
     monkeypatch.delenv(fleet_kernel.LIMIT, raising=False)
     runnable = fleet_kernel.variants()
     monkeypatch.setenv(fleet_kernel.LIMIT, "")
@@ -268,14 +268,14 @@ def test_the_environment_limits_the_variant(monkeypatch, limit):
     assert Fleet("cable", 2, 1).lanes == fleet_kernel.library().fleet_lanes(fleet_kernel.VARIANTS.index(allowed[-1]))
 
 
-def test_a_limit_that_is_no_variant_is_refused_in_one_line(monkeypatch):
+def test_limit_that_is_no_variant_is_refused_in_one_line(monkeypatch):
     monkeypatch.setenv(fleet_kernel.LIMIT, "AVX-2")
     with pytest.raises(UsageError, match=r"^MODSOFT_KERNEL is 'AVX-2', expected plain, avx2, avx512; .*") as refused:
         fleet_kernel.variants()
     assert "\n" not in str(refused.value)
 
 
-def test_pyelastica_serves_where_the_kernel_is_missing(monkeypatch, capsys):
+def test_pyelastica_is_used_without_the_kernel(monkeypatch, capsys):
     monkeypatch.setattr(fleet_kernel, "library", lambda: None)
     robots = fleet.simulated("pneumatic", 2, 3)
     assert isinstance(robots, Arms)
@@ -304,7 +304,7 @@ def test_opposite_cables_share_an_actuator_and_chambers_do_not(kind):
 
 
 @needs_kernel
-def test_the_benchmark_measures_prints_and_draws(tmp_path):
+def test_benchmark_measures_prints_and_draws(tmp_path):
     benchmark = benchmarks.load("simulation")
     result = benchmark.measured(["pneumatic"], [2], [1, 8], rounds=1)
     assert [row["robots"] for row in result["rows"]] == [1, 8]
@@ -331,7 +331,7 @@ def test_the_benchmark_measures_prints_and_draws(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 20])
-def test_what_was_read_of_a_robot_stays_when_it_moves_on(count):
+def test_arrays_of_a_state_do_not_change_in_later_steps(count):
     fleet = Fleet("cable", 2, count)
     read = {name: getattr(fleet, name) for name in ("positions", "directors", "configuration")}
     kept = {name: values.copy() for name, values in read.items()}

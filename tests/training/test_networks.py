@@ -1,4 +1,4 @@
-"""The networks: what each hears, and what it refuses."""
+"""The networks: the inputs that each output depends on, and invalid arguments."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def made(name, **changes):
 
 
 def windows(count=3, modules=N, seed=0):
-    """Features (B, N, F) as the runtime lays them out, and the states and actions in them."""
+    """Features (B, N, F) in the layout of the runtime, and the states and actions in them."""
     rng = np.random.default_rng(seed)
     states, actions = rng.uniform(-1, 1, (count, T, modules, S)), rng.uniform(-1, 1, (count, T, modules, A))
     return torch.from_numpy(features(states, actions)).float(), states, actions
@@ -47,8 +47,8 @@ def test_every_network_gives_the_actuation_of_every_module():
         assert made(name)(x).shape == (3, N, A)
 
 
-def test_lstm_sees_all_modules_side_by_side_slot_after_slot():
-    """Against a plain LSTM fed by hand from the states and actions themselves."""
+def test_lstm_gets_all_modules_slot_by_slot():
+    """Against a plain LSTM on the states and actions."""
     network = made("lstm")
     x, states, actions = windows()
     by_hand = torch.zeros(3, T, N * (S + A))
@@ -62,7 +62,7 @@ def test_lstm_sees_all_modules_side_by_side_slot_after_slot():
     torch.testing.assert_close(network(x), expected)
 
 
-def test_module_lstm_hears_its_own_module_alone_and_shares_no_weight():
+def test_module_lstm_depends_on_its_own_module_and_shares_no_weight():
     network = made("module-lstm")
     x, _, _ = windows()
     depends = heard(network, x)
@@ -70,14 +70,14 @@ def test_module_lstm_hears_its_own_module_alone_and_shares_no_weight():
         others = torch.cat([depends[module, :module], depends[module, module + 1 :]])
         assert not others.any()
         assert depends[module, module, :-1].all()
-    alike = x.clone()
-    alike[:] = x[:, :1]  # the same features for all modules
-    outputs = network(alike)
+    same = x.clone()
+    same[:] = x[:, :1]  # the same features for all modules
+    outputs = network(same)
     assert all(not torch.equal(outputs[:, 0], outputs[:, i]) for i in range(1, N))
 
 
 @pytest.mark.parametrize("name", ["lstm", "module-lstm"])
-def test_bound_networks_leave_the_label_out(name):
+def test_bound_networks_do_not_use_the_label(name):
     x, _, _ = windows()
     assert feature_names("cable", T)[-1] == "label"
     assert not heard(made(name), x)[..., -1].any()
@@ -114,7 +114,7 @@ def test_dropout_is_between_layers_and_in_training_only():
         assert not torch.equal(network(x), network(x))
 
 
-def test_a_description_that_no_network_has():
+def test_invalid_description_is_refused():
     with pytest.raises(ModelError, match="'gru', expected one of bilstm, lstm, module-lstm"):
         networks.build(described("gru"))
     nameless = described("lstm")

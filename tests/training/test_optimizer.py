@@ -19,7 +19,7 @@ def matrix(rows, columns, smallest=0.02, seed=0):
 
 
 @pytest.mark.parametrize("shape", [(32, 32), (16, 48), (48, 16), (64, 5)])
-def test_the_update_has_the_singular_vectors_of_the_matrix_and_singular_values_near_one(shape):
+def test_update_has_the_singular_vectors_of_the_matrix_and_singular_values_near_one(shape):
     given, u, v = matrix(*shape)
     update = optimizer.orthogonalized(given)
     values = torch.linalg.svdvals(update)
@@ -29,7 +29,7 @@ def test_the_update_has_the_singular_vectors_of_the_matrix_and_singular_values_n
     assert torch.diagonal(among_them).min() > 0.72  # the signs are kept
 
 
-def test_a_batch_is_its_matrices_one_by_one_and_zero_stays_zero():
+def test_batch_equals_its_single_matrices_and_zero_stays_zero():
     matrices = torch.stack([matrix(8, 16, seed=seed)[0] for seed in range(3)] + [torch.zeros(8, 16)])
     updates = optimizer.orthogonalized(matrices)
     for one, other in zip(matrices, updates, strict=True):
@@ -37,7 +37,7 @@ def test_a_batch_is_its_matrices_one_by_one_and_zero_stays_zero():
     assert torch.equal(updates[3], torch.zeros(8, 16))
 
 
-def test_the_coefficients_are_the_best_for_singular_values_from_a_hundredth_to_one():
+def test_coefficients_are_the_best_for_singular_values_from_a_hundredth_to_one():
     low, high = 0.01, 1.0
     for coefficients in optimizer.POLYNOMIALS:
         x = np.union1d(np.geomspace(low, high, 2000), np.linspace(low, high, 2000))

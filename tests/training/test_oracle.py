@@ -1,4 +1,4 @@
-"""The floor of a task: motions that the robot can make are found again, those that it cannot leave what they must."""
+"""The oracle error: zero for motions that the robot can make, and the least possible for others."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ pytestmark = [
 
 
 def motion(modules=2, steps=8, seed=0):
-    """Configurations (K, N, 3) at the start of each period under actions that wander, from rest: a floor of 0."""
+    """Configurations (K, N, 3) at the start of each period under a random walk of actions: no oracle error."""
     wander = np.cumsum(np.random.default_rng(seed).uniform(-0.25, 0.25, (steps, 1, modules, 2)), axis=0)
     return rollout(Fleet("cable", modules, 1), np.clip(wander, -0.9, 0.9)).configuration[:-1, 0]
 
@@ -33,7 +33,7 @@ def beyond_reach(steps=6):
 
 
 @pytest.mark.parametrize("modules", [2, 4])
-def test_a_motion_that_the_robot_made_is_found_again(modules):
+def test_motion_of_the_robot_has_no_oracle_error(modules):
     desired = motion(modules)
     found = oracle_error("cable", modules, desired)
     assert found.actions.shape == (8, modules, 2)
@@ -50,7 +50,7 @@ def test_the_first_error_is_that_of_the_robot_at_rest():
     assert found.errors[1:].max() < 2e-3
 
 
-def test_beyond_reach_the_cable_pulls_all_it_can_and_the_other_module_stays():
+def test_beyond_reach_the_actuation_saturates_and_the_other_module_stays():
     found = oracle_error("cable", 2, beyond_reach())
     assert (np.abs(found.actions) <= 1.0).all()
     assert found.actions[:5, 1, 1].max() < -0.99
@@ -64,7 +64,7 @@ def test_the_same_seed_gives_the_same_actions():
     assert np.array_equal(first.actions, second.actions)
 
 
-def test_whole_sequences_improve_from_anything_and_never_get_worse():
+def test_improved_sequences_are_never_worse():
     desired = motion(steps=10)
     from_nothing = improved("cable", 2, desired, np.zeros((10, 2, 2)))
     assert errors(desired, from_nothing).mean() < 0.05 * errors(desired, np.zeros((10, 2, 2))).mean()
@@ -73,7 +73,7 @@ def test_whole_sequences_improve_from_anything_and_never_get_worse():
     assert errors(beyond_reach(), after).sum() <= errors(beyond_reach(), before).sum()
 
 
-def test_an_actions_slopes_are_those_of_its_own_period_and_the_next():
+def test_slopes_equal_finite_differences():
     actions = np.random.default_rng(1).uniform(-0.5, 0.5, (4, 2, 2))
     _, taken, configuration = oracle._traced("cable", 2, actions, motion(steps=4))
     slopes = oracle._slopes("cable", 2, actions, taken, configuration).toarray().reshape(4, 6, 4, 4)
@@ -86,11 +86,11 @@ def test_an_actions_slopes_are_those_of_its_own_period_and_the_next():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_bounded_minimum_is_that_of_scipy(seed):
+def test_bounded_minimum_equals_that_of_scipy(seed):
     random = np.random.default_rng(seed)
-    matrix, aim = random.normal(size=(12, 6)), 3.0 * random.normal(size=12)
+    matrix, target = random.normal(size=(12, 6)), 3.0 * random.normal(size=12)
     lower, upper = -random.random(6), random.random(6)
-    found = oracle._bounded_minimum(sparse.csr_array(matrix.T @ matrix), -matrix.T @ aim, lower, upper)
-    expected = lsq_linear(matrix, aim, bounds=(lower, upper)).x
+    found = oracle._bounded_minimum(sparse.csr_array(matrix.T @ matrix), -matrix.T @ target, lower, upper)
+    expected = lsq_linear(matrix, target, bounds=(lower, upper)).x
     assert ((found >= lower) & (found <= upper)).all()
     assert np.abs(found - expected).max() < 1e-4

@@ -1,4 +1,4 @@
-"""Pictures are the same under any settings of the user's."""
+"""Pictures do not depend on the settings of the user."""
 
 import os
 import re
@@ -50,12 +50,12 @@ def expected(tmp_path_factory):
 @pytest.mark.parametrize(
     "backend", ["module://matplotlib_inline.backend_inline", "module://no_such_module", "TkAgg", "nonsense"]
 )
-def test_a_backend_of_the_user_changes_nothing(backend, expected, tmp_path):
+def test_backend_of_the_user_has_no_effect(backend, expected, tmp_path):
     assert drawn(tmp_path, MPLBACKEND=backend) == expected
 
 
 @pytest.mark.parametrize("where", ["current folder", "MATPLOTLIBRC"])
-def test_settings_of_the_user_change_nothing(where, expected, tmp_path):
+def test_settings_of_the_user_have_no_effect(where, expected, tmp_path):
     folder = tmp_path if where == "current folder" else tmp_path / "settings"
     folder.mkdir(exist_ok=True)
     settings = ("text.usetex: True", "font.size: 30", "savefig.transparent: True", "savefig.bbox: tight", "nonsense")
@@ -63,7 +63,7 @@ def test_settings_of_the_user_change_nothing(where, expected, tmp_path):
     assert drawn(tmp_path, MATPLOTLIBRC=str(folder)) == expected
 
 
-def test_settings_of_a_program_change_nothing_and_stay(tmp_path):
+def test_settings_of_a_program_have_no_effect_and_remain(tmp_path):
     def draw():
         assert not matplotlib.rcParams["text.usetex"]
         return plotting.figure(1.0, 1.0)
@@ -73,7 +73,7 @@ def test_settings_of_a_program_change_nothing_and_stay(tmp_path):
         assert matplotlib.rcParams["text.usetex"]
 
 
-def test_a_picture_that_fails_is_one_line(tmp_path):
+def test_failure_is_one_line(tmp_path):
     def draw():
         figure = plotting.figure(1.0, 1.0)
         figure.text(0.5, 0.5, "$\\nonsense$")

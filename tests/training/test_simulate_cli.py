@@ -1,4 +1,4 @@
-"""`modsoft-simulate`: what it writes, and every wrong actions file in one line with exit code 65."""
+"""`modsoft-simulate`: its output, and invalid actions, refused in one line with exit code 65."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from modsoft.training.simulation import elastica
 
 @pytest.fixture(name="run")
 def _run(monkeypatch, capsys):
-    """Runs the console script; its exit code and what it said on standard error."""
+    """Runs the console script; returns its exit code and its standard error."""
 
     def run(*arguments: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["modsoft-simulate", *map(str, arguments)])
@@ -25,7 +25,7 @@ def _run(monkeypatch, capsys):
     return run
 
 
-def test_it_writes_the_state_before_the_first_and_after_each_action(tmp_path, run):
+def test_output_has_the_state_before_the_first_and_after_each_action(tmp_path, run):
     actions = tmp_path / "a.npy"
     np.save(actions, np.array([[[0.5], [-0.5]], [[1.0], [0.0]], [[0.0], [0.0]]]))
     out = tmp_path / "run.bin"  # the name is kept as given, not turned into run.bin.npz
@@ -46,7 +46,7 @@ def test_it_writes_the_state_before_the_first_and_after_each_action(tmp_path, ru
 
 
 @pytest.mark.parametrize(
-    ("actions", "said"),
+    ("actions", "message"),
     [
         (np.zeros((5, 3, 1)), "found shape (5, 3, 1), expected (steps, 2, 1) for pneumatic-2"),
         (np.zeros((0, 2, 1)), "found shape (0, 2, 1), expected (steps, 2, 1)"),
@@ -55,18 +55,18 @@ def test_it_writes_the_state_before_the_first_and_after_each_action(tmp_path, ru
         (np.array([[["a"], ["b"]]]), "found no array of numbers"),
     ],
 )
-def test_wrong_actions_are_one_line_and_65(tmp_path, run, actions, said):
+def test_wrong_actions_are_one_line_and_65(tmp_path, run, actions, message):
     path = tmp_path / "a.npy"
     np.save(path, actions)
     code, err = run("--robot", "pneumatic-2", "--actions", path, "--out", tmp_path / "run.npz")
     assert code == 65
-    assert said in err
+    assert message in err
     assert err.count("\n") == 1
     assert not (tmp_path / "run.npz").exists()
 
 
 @pytest.mark.parametrize("content", [None, b"", b"not an array", b"\x93NUMPY\x01\x00"])
-def test_a_missing_or_damaged_actions_file_is_one_line_and_65(tmp_path, run, content):
+def test_missing_or_damaged_actions_file_is_one_line_and_65(tmp_path, run, content):
     path = tmp_path / "a.npy"
     if content is not None:
         path.write_bytes(content)
@@ -95,11 +95,11 @@ def test_diverging_simulation_is_one_line_that_names_the_step(tmp_path, run, mon
     assert not (tmp_path / "run.npz").exists()
 
 
-def test_an_unknown_robot_is_64(tmp_path, run):
+def test_unknown_robot_is_64(tmp_path, run):
     assert run("--robot", "pneumatic-9", "--actions", "a.npy", "--out", "run.npz")[0] == 64
 
 
-def test_an_output_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
+def test_output_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
     run = {"configuration": np.zeros(1)}
     with pytest.raises(UsageError, match="no folder"):
         simulate_cli.write(str(tmp_path / "absent" / "run.npz"), run)

@@ -1,4 +1,4 @@
-"""The simulated robots behind collection: they agree, and a killed collection of the real robot goes on."""
+"""The simulators of collection: they agree, and a killed collection resumes."""
 
 import subprocess
 import sys
@@ -34,15 +34,15 @@ def test_elastica_starts_every_episode_from_rest():
     np.testing.assert_array_equal(found[1], simulators.by_elastica(robot, actions[1:])[0])
 
 
-def test_a_robot_lost_by_elastica_is_not_a_number_from_there_on(monkeypatch):
+def test_diverged_robot_of_elastica_is_nan_from_then_on(monkeypatch):
     step = elastica.Arm.step
 
-    def lost(self, action, period_s):
+    def diverging(self, action, period_s):
         if action[0, 0] == 0.75:
-            raise ModsoftError("lost")
+            raise ModsoftError("diverged")
         return step(self, action, period_s)
 
-    monkeypatch.setattr(elastica.Arm, "step", lost)
+    monkeypatch.setattr(elastica.Arm, "step", diverging)
     robot, actions = draw("pneumatic-2", 2, 4)
     actions[0, 2] = 0.75
     found = simulators.by_elastica(robot, actions)
@@ -53,7 +53,7 @@ def test_a_robot_lost_by_elastica_is_not_a_number_from_there_on(monkeypatch):
 
 @needs_fleet
 @pytest.mark.parametrize("name", ["pneumatic-3", "cable-4"])
-def test_the_fleet_agrees_with_elastica_and_not_with_its_neighbours(name):
+def test_fleet_agrees_with_elastica_and_robots_are_independent(name):
     robot, actions = draw(name, 3, 4)
     together = simulators.by_fleet(robot, actions)
     # The fleet integrates the damping of the rotation in its own way; up to 6e-5 was seen, a wrong wiring gives 0.1.
@@ -63,8 +63,8 @@ def test_the_fleet_agrees_with_elastica_and_not_with_its_neighbours(name):
 
 
 @needs_fleet
-def test_a_robot_that_goes_non_finite_in_the_fleet_is_dropped_and_drawn_again(tmp_path, monkeypatch):
-    """Planted in the middle of one rod at the last step, where no module end shows it yet."""
+def test_diverged_robot_of_the_fleet_is_rejected_and_replaced(tmp_path, monkeypatch):
+    """The divergence is in the middle of a rod at the last step, where the module ends are still finite."""
     steps, victim, planted = 6, 3, []
     step = Fleet.step
 
@@ -93,7 +93,7 @@ def test_a_robot_that_goes_non_finite_in_the_fleet_is_dropped_and_drawn_again(tm
     np.testing.assert_array_equal(again[0], found.configuration[victim])
 
 
-def test_a_plant_is_had_by_its_name():
+def test_simulators_are_selected_by_name():
     robot = robots.load("pneumatic-2")
     assert simulators.names()[-1] == "elastica"
     assert simulators.fastest(robot).name == simulators.names()[0]
@@ -103,7 +103,7 @@ def test_a_plant_is_had_by_its_name():
 
 
 @needs_fleet
-def test_a_named_variant_gives_the_same_bits_everywhere():
+def test_named_variant_gives_the_same_bits():
     robot, actions = draw("pneumatic-2", 2, 3)
     plain = simulators.by_name("fleet-plain", robot).simulate(robot, actions)
     np.testing.assert_array_equal(plain, simulators.by_fleet(robot, actions, "plain"))
@@ -117,7 +117,7 @@ def test_a_named_variant_gives_the_same_bits_everywhere():
         ("valve", "p_max_bar", 0.5, r"0.08, 0.5; expected 0.08, 0.35, the pressures of the simulated robot"),
     ],
 )
-def test_what_cannot_be_simulated_is_refused(section, key, value, message):
+def test_unsuitable_robots_are_refused(section, key, value, message):
     table = robots.load("pneumatic-3").to_dict()
     table[section] = {**table[section], key: value}
     with pytest.raises(RobotFileError, match=message):
@@ -129,12 +129,14 @@ def command(*arguments: str) -> list[str]:
 
 
 @needs_fleet
-def test_a_killed_collection_of_the_real_robot_gives_the_same_file(tmp_path):
+def test_killed_collection_gives_the_same_file(tmp_path):
     """modsoft-collect with two processes, ended by SIGKILL after its first episodes."""
-    asked = ["--samples", "12800", "--steps", "400", "--jobs", "2", "--seed", "4"]
-    straight = subprocess.run(command(*asked, "--out", "straight.h5"), cwd=tmp_path, capture_output=True, check=False)
+    arguments = ["--samples", "12800", "--steps", "400", "--jobs", "2", "--seed", "4"]
+    straight = subprocess.run(
+        command(*arguments, "--out", "straight.h5"), cwd=tmp_path, capture_output=True, check=False
+    )
     assert straight.returncode == 0, straight.stderr
-    victim = subprocess.Popen(command(*asked, "--out", "killed.h5"), cwd=tmp_path, stderr=subprocess.DEVNULL)
+    victim = subprocess.Popen(command(*arguments, "--out", "killed.h5"), cwd=tmp_path, stderr=subprocess.DEVNULL)
     parts = tmp_path / "killed.h5.parts"
     patience = time.monotonic() + 60
     while not any(parts.glob("episode-*.npz")):
@@ -144,7 +146,7 @@ def test_a_killed_collection_of_the_real_robot_gives_the_same_file(tmp_path):
     victim.wait()
     assert not (tmp_path / "killed.h5").exists()
     again = subprocess.run(
-        command(*asked, "--out", "killed.h5"), cwd=tmp_path, capture_output=True, text=True, check=False
+        command(*arguments, "--out", "killed.h5"), cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert again.returncode == 0, again.stderr
     assert "killed.h5: 12800 samples in 32 episodes" in again.stdout
@@ -152,14 +154,14 @@ def test_a_killed_collection_of_the_real_robot_gives_the_same_file(tmp_path):
     assert dataset.read(tmp_path / "killed.h5").rejected == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["killed.h5", "straight.h5"]
     other = subprocess.run(
-        command(*asked[:-1], "5", "--out", "killed.h5"), cwd=tmp_path, capture_output=True, text=True, check=False
+        command(*arguments[:-1], "5", "--out", "killed.h5"), cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert other.returncode == 65
     assert "begun with seed 4, expected 5" in other.stderr
     assert other.stderr.count("\n") == 1
 
 
-def test_help_comes_without_the_simulator(tmp_path):
+def test_help_does_not_import_the_simulator(tmp_path):
     code = "import sys; from modsoft.training import collect_cli; assert not {'elastica', 'numba'} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     found = subprocess.run(command("--help"), capture_output=True, text=True, check=False)
@@ -177,14 +179,14 @@ def test_help_comes_without_the_simulator(tmp_path):
         (["--out", "d.h5", "--simulator", "other"], "the simulator other does not run here"),
     ],
 )
-def test_what_is_missing_or_wrong_is_told(tmp_path, arguments, message):
+def test_wrong_arguments_are_refused(tmp_path, arguments, message):
     found = subprocess.run(command(*arguments), cwd=tmp_path, capture_output=True, text=True, check=False)
     assert found.returncode == 2
     assert message in found.stderr
 
 
 @needs_fleet
-def test_the_benchmark_of_collection_measures_and_prints():
+def test_benchmark_of_collection_measures_and_prints():
     benchmark = benchmarks.load("collect")
     result = benchmark.measured([("pneumatic-2", 1200)], [1, 2])
     one, two = result["rows"]

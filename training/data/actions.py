@@ -1,4 +1,4 @@
-"""The random actions that data are collected with (section 2.2 of the paper), and smooth ones beside them."""
+"""Random actions for the collection of data (section 2.2 of the paper), and smooth ones."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from modsoft.runtime.control.actuation import limited
 from modsoft.runtime.robot import Robot
 
 JITTER = (0.003, 0.3)  # of smooth actions, smallest and largest
-KNOTS = (4.0, 60.0)  # steps from one random action to the next on the way of a smooth sequence, quickest and slowest
-OVER = 1.3  # knots are drawn from a range this much larger and cut to it, so that its ends are visited
+KNOT_STEPS = (4.0, 60.0)  # from one knot, a random action, to the next in a smooth sequence, fastest and slowest
+KNOT_RANGE = 1.3  # knots are drawn from [-1.3, 1.3] and clipped to [-1, 1], so that its ends occur
 
 
 def stage_borders(strategy: str, modules: int, steps: int) -> NDArray[np.int64]:
@@ -26,13 +26,13 @@ def draw_actions(robot: Robot, strategy: str, steps: int, rng: np.random.Generat
     """Random actions (steps, N, A) in [-1, 1], uniform over the range.
 
     staged: in stage s = 0..N-1 the first N - s modules share one sequence, every further module has its own (section
-    2.2, for any N); random: every module has its own, always; smooth and varied: as a task would move the robot, which
-    random actions never do.
+    2.2, for any N). random: every module has its own. smooth and varied: motion as in tasks, which random actions never
+    produce.
 
     Where the robot file bounds the step between two control periods, the sequence is a random walk reflected at the
-    ends of the range: its steps never exceed the bound and in the long run it is exactly uniform, ends included. Each
-    walk changes its pace now and then, so that slow motion is seen as well as fast. It goes on over stage borders,
-    where the bound holds too.
+    ends of the range: its steps never exceed the bound, and its distribution converges to the uniform one. Each walk
+    changes its pace from time to time, so that the data contain slow and fast motion. The walk and the bound continue
+    over stage borders.
     """
     shape = (steps, robot.modules, robot.action_size)
     largest = robot.limits.largest_actuation_step
@@ -44,15 +44,15 @@ def draw_actions(robot: Robot, strategy: str, steps: int, rng: np.random.Generat
     if strategy == "staged":
         borders = stage_borders(strategy, robot.modules, steps)
         for stage, (begin, end) in enumerate(itertools.pairwise(borders)):
-            alike = robot.modules - stage
-            drawn[begin:end, 1:alike] = drawn[begin:end, :1]
+            shared = robot.modules - stage
+            drawn[begin:end, 1:shared] = drawn[begin:end, :1]
     return drawn if largest >= 2.0 else _reflected_walk(drawn)
 
 
 def _paces(shape: tuple[int, int, int], rng: np.random.Generator) -> Array:
-    """Share of the largest step in (0, 1] that each walk (steps, N, A) keeps to; changes every 20 steps on average.
+    """Largest step of each walk (steps, N, A) as a fraction, 0 to 1, of the bound; changes every 20 steps on average.
 
-    Cubed, so that half of them are below an eighth: tasks move slowly, and friction shows when a robot does.
+    Cubed, so that half of them are below an eighth: tasks move slowly, and the effect of friction is largest there.
     """
     paces = rng.uniform(0.0, 1.0, shape) ** 3
     for step, changes in enumerate(rng.uniform(size=shape) < 0.05):
@@ -68,9 +68,9 @@ def _reflected_walk(increments: Array) -> Array:
 
 
 def _smooth(robot: Robot, steps: int, rng: np.random.Generator) -> Array:
-    """Actions (steps, N, A) that wander from knot to knot, with a little jitter: without it the network could not tell
-    what a small change of the action does. Some modules follow one sequence, each with its own gain, others their own;
-    how many is drawn for each episode."""
+    """Actions (steps, N, A) along curves between random knots, with jitter, from which the network learns the effect of
+    small changes. Some modules follow a shared sequence, each with its own gain, others have their own; their number is
+    random in each episode."""
     shape = (steps, robot.modules, robot.action_size)
     shared, follows = _wander(steps, robot.action_size, rng), rng.uniform()
     actions = np.empty(shape)
@@ -90,16 +90,16 @@ def _smooth(robot: Robot, steps: int, rng: np.random.Generator) -> Array:
 
 
 def _wander(steps: int, action_size: int, rng: np.random.Generator) -> Array:
-    """One sequence (steps, A) from knot to knot along cosines; one in two begins with a jump from rest."""
-    pace = np.exp(rng.uniform(*np.log(KNOTS)))
+    """One sequence (steps, A) along cosines between knots; half of the sequences begin with a jump from rest."""
+    pace = np.exp(rng.uniform(*np.log(KNOT_STEPS)))
     knots = [0.0]
     while knots[-1] <= steps:
         knots.append(knots[-1] + max(2.0, pace * np.exp(rng.normal(0.0, 0.4))))
-    values = np.clip(rng.uniform(-OVER, OVER, (len(knots), action_size)), -1.0, 1.0)
+    values = np.clip(rng.uniform(-KNOT_RANGE, KNOT_RANGE, (len(knots), action_size)), -1.0, 1.0)
     if rng.uniform() < 0.5:
         values[0] = 0.0
     at = np.arange(steps)
     before = np.searchsorted(knots, at, side="right") - 1
-    share = (at - np.take(knots, before)) / np.diff(knots)[before]
-    share = (0.5 - 0.5 * np.cos(np.pi * share))[:, None]
-    return values[before] * (1.0 - share) + values[before + 1] * share
+    fraction = (at - np.take(knots, before)) / np.diff(knots)[before]
+    weight = (0.5 - 0.5 * np.cos(np.pi * fraction))[:, None]
+    return values[before] * (1.0 - weight) + values[before + 1] * weight

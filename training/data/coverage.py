@@ -1,13 +1,13 @@
-"""The space that a data set covers: where the module ends were, as pictures (the paper's Figure 4) and as a number.
+"""The space that a data set covers: the positions of the module ends, as pictures (the paper's Figure 4), and its size.
 
-A data set holds directions, not places. The module ends are those of a chain of arcs without twist, each as long as a
-module at rest: the same for simulated and measured data. The simulated robots also stretch and sag; their true module
-ends are 6 mm from the arcs' in the mean at the tip of `pneumatic-3` (162 mm long) and 15 mm at that of `cable-4`
-(200 mm).
+A data set contains directions, not positions. The module ends are those of a chain of arcs without twist, each of the
+length of a module at rest, for simulated and for measured data. The simulated robots also stretch and sag: at the tip,
+their true module ends differ from those of the arcs by 6 mm in the mean for `pneumatic-3` (162 mm long) and by 15 mm
+for `cable-4` (200 mm).
 
-The covered space of a module is the volume of the cubes of a grid that its end came into, cm3, or for a planar robot
-the area of the squares, cm2. It grows with the number of samples, so that data sets are compared at the number that the
-smallest of them has.
+The covered space of a module is the volume of the cubes of a grid that its end enters, cm3, or for a planar robot the
+area of the squares, cm2. It increases with the number of samples, so that data sets are compared at the number of
+samples of the smallest one.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from modsoft.training.simulation.parameters import PARAMETERS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CUBE, SQUARE = 1 / 4, 1 / 25  # edge over the module's length: random data leave few gaps at that size
+CUBE, SQUARE = 1 / 4, 1 / 25  # edge over the module's length: with random data few cells are empty at that size
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Coverage:
 
 
 def module_ends(configuration: Array, length_m: float) -> Array:
-    """Module ends (..., N, 3), m, of arcs of `length_m` that have the configurations (..., N, 3)."""
+    """Module ends (..., N, 3), m, of arcs of `length_m` with the configurations (..., N, 3)."""
     across, along = configuration[..., :2], configuration[..., 2]
     angle = np.arctan2(np.linalg.norm(across, axis=-1), along)
     # Chord of an arc from e3 to v: 2 sin(a / 2) / a long, along e3 + v.
@@ -64,15 +64,15 @@ def module_ends(configuration: Array, length_m: float) -> Array:
 
 
 def _turn(direction: Array) -> Array:
-    """Rotations (..., 3, 3) that take e3 to `direction` (..., 3) the shortest way."""
+    """The smallest rotations (..., 3, 3) from e3 to `direction` (..., 3)."""
     x, y, z = np.moveaxis(direction, -1, 0)
-    share = 1.0 / np.maximum(1.0 + z, 1e-12)  # a module bent by 180 degrees has no shortest way
-    rows = [[1 - x * x * share, -x * y * share, x], [-x * y * share, 1 - y * y * share, y], [-x, -y, z]]
+    factor = 1.0 / np.maximum(1.0 + z, 1e-12)  # for a module bent by 180 degrees it is not unique
+    rows = [[1 - x * x * factor, -x * y * factor, x], [-x * y * factor, 1 - y * y * factor, y], [-x, -y, z]]
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def covered(positions: Array, length_m: float, planar: bool) -> Array:
-    """Space (N,) that the module ends (samples, N, 3), m, came into: cm3, or cm2 in the x-z plane."""
+    """Space (N,) that the module ends (samples, N, 3), m, enter: cm3, or cm2 in the x-z plane."""
     edge_m = length_m * (SQUARE if planar else CUBE)
     cells = np.floor((positions[..., [0, 2]] if planar else positions) / edge_m).astype(np.int64)
     count = [len(np.unique(cells[:, module], axis=0)) for module in range(positions.shape[1])]
@@ -80,8 +80,8 @@ def covered(positions: Array, length_m: float, planar: bool) -> Array:
 
 
 def compare(paths: list[Path]) -> list[Coverage]:
-    """The coverage of each data set, at the number of samples of the smallest; `ModelError` unless all robots are of
-    one kind and module number."""
+    """The coverage of each data set, at the number of samples of the smallest; `ModelError` for robots of different
+    kinds or numbers of modules."""
     sets = [dataset.read(path) for path in paths]
     robots = {(data.robot.kind, data.robot.modules) for data in sets}
     if len(robots) > 1:
@@ -90,19 +90,19 @@ def compare(paths: list[Path]) -> list[Coverage]:
     kind, modules = robots.pop()
     length_m = PARAMETERS[kind].module_length_m
     samples = min(data.samples for data in sets)
-    found = []
+    coverages = []
     for path, data in zip(paths, sets, strict=True):
         planar = kind == "pneumatic"
         reached = data.configuration[:, 1:].reshape(-1, modules, 3)
         evenly = np.linspace(0, len(reached) - 1, samples).round().astype(np.int64)
         positions = module_ends(reached[evenly], length_m)
         strategy = str(data.generation["strategy"])
-        found.append(Coverage(path.name, strategy, planar, positions, covered(positions, length_m, planar)))
-    return found
+        coverages.append(Coverage(path.name, strategy, planar, positions, covered(positions, length_m, planar)))
+    return coverages
 
 
 def line(coverage: Coverage) -> str:
-    """The figures of one data set in one line."""
+    """The numbers of one data set in one line."""
     figures = ", ".join(f"{value:.4g}" for value in coverage.covered)
     return (
         f"{coverage.name} ({coverage.strategy}): modules 1 to {len(coverage.covered)} cover {figures} {coverage.unit}, "
@@ -110,20 +110,22 @@ def line(coverage: Coverage) -> str:
     )
 
 
-def draw(found: list[Coverage], out: Path) -> None:
-    """A column for each data set: seen from the side, gravity downwards, and if not planar along the axis too. `out` is
-    written whole or not at all, in the format of its ending; `UsageError` for one that is none."""
-    plotting.save(lambda: _figure(found), out, dpi=150)
+def draw(coverages: list[Coverage], out: Path) -> None:
+    """A column for each data set: the view from the side, gravity downwards, and for robots in space along the axis.
+
+    `out` is written completely or not at all, in the format of its suffix; `UsageError` for an unknown one.
+    """
+    plotting.save(lambda: _figure(coverages), out, dpi=150)
 
 
-def _figure(found: list[Coverage]) -> Figure:
-    views = [(0, 2, "x (mm)", "z (mm)")] + ([] if found[0].planar else [(0, 1, "x (mm)", "y (mm)")])
-    figure = plotting.figure(1.0 + 4.2 * len(found), 0.8 + 4.0 * len(views))
-    axes = figure.subplots(len(views), len(found), squeeze=False, sharex=True, sharey="row")
-    for column, each in enumerate(found):
+def _figure(coverages: list[Coverage]) -> Figure:
+    views = [(0, 2, "x (mm)", "z (mm)")] + ([] if coverages[0].planar else [(0, 1, "x (mm)", "y (mm)")])
+    figure = plotting.figure(1.0 + 4.2 * len(coverages), 0.8 + 4.0 * len(views))
+    axes = figure.subplots(len(views), len(coverages), squeeze=False, sharex=True, sharey="row")
+    for column, each in enumerate(coverages):
         for row, (across, up, across_name, up_name) in enumerate(views):
             axis = axes[row, column]
-            for module in reversed(range(each.positions.shape[1])):  # the base last: it covers the least
+            for module in reversed(range(each.positions.shape[1])):  # the base last, on top: it covers the least
                 place = 1e3 * each.positions[:, module]
                 label = f"module {module + 1}: {each.covered[module]:.4g} {each.unit}"
                 axis.plot(place[:, across], place[:, up], ".", ms=1.2, alpha=0.5, label=label, rasterized=True)
