@@ -29,11 +29,11 @@ from modsoft.runtime.files import check_not_input, check_writable
     "--strategy",
     default="staged",
     type=click.Choice(STRATEGIES),
-    help="Of the random actions. staged: all modules share one sequence at first, fewer of them in every stage, as in "
+    help="Kind of random actions. staged: all modules share one sequence at first, fewer of them in every stage, as in "
     "the paper. random: every module has its own. smooth: slow motion as in tasks. varied: smooth, on robots with "
     "other stiffness and payload.",
 )
-@click.option("--seed", default=0, type=click.IntRange(0), help="The same seed gives the same data set.")
+@click.option("--seed", default=0, type=click.IntRange(0), help="Random seed; the same seed gives the same data set.")
 @click.option("--steps", default=300, type=click.IntRange(1), help="Control steps of an episode, which starts at rest.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes, cluster jobs or workers at a time.  [default: cores]")
 @click.option(
@@ -51,7 +51,7 @@ from modsoft.runtime.files import check_not_input, check_writable
     "and its parameters (cores=1, memory=2GB, ...). dask runs all code that its ports receive: keep them off open "
     "networks, or use its TLS (security=true). May be repeated.",
 )
-@click.option("--simulator", help="elastica, fleet-plain, fleet-avx2, ...  [default: the fastest here]")
+@click.option("--simulator", help="Simulator: elastica, fleet-plain, fleet-avx2, ...  [default: the fastest here]")
 @renamed_option("--plant", "--simulator")
 @click.pass_context
 def cli(
@@ -83,7 +83,7 @@ def cli(
         raise click.UsageError(f"missing option {'--out' if robot_file else '--robot'}; see --help", context)
     check_not_input(out, Path(robot_file))
     robot = robots.load(robot_file)
-    given = dict(_option(text) for text in options)
+    backend_options = dict(_option(text) for text in options)
     from tqdm import tqdm
 
     from modsoft.training.data.backends import cores
@@ -102,7 +102,9 @@ def cli(
         bar.update(done - bar.n)
 
     try:
-        header = collect(robot, out, samples, strategy, seed, steps, jobs or cores(), chosen, progress, backend, given)
+        header = collect(
+            robot, out, samples, strategy, seed, steps, jobs or cores(), chosen, progress, backend, backend_options
+        )
     finally:
         if bar is not None:
             bar.close()

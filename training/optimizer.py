@@ -73,14 +73,14 @@ class Muon(torch.optim.Optimizer):
 
 
 def _factors(matrix: torch.Tensor) -> torch.Tensor:
-    """The matrices (..., m, n) that are orthogonalized for an LSTM's (4 H, K): one a gate where K > H, as half of the
-    work, else the whole, whose short side is K."""
+    """The matrices (..., m, n) that are orthogonalized for an LSTM's (4 H, K): one for each gate where K > H, which is
+    half of the work, else the whole one, whose short side is K."""
     rows, columns = matrix.shape
     return matrix.reshape(GATES, rows // GATES, columns) if columns > rows // GATES else matrix
 
 
 class MuonAndAdam:
-    """Both as one. `rate` is Adam's; Muon's follows it."""
+    """Both optimizers as one. The learning rate is Adam's; that of Muon is proportional to it."""
 
     def __init__(self, network: torch.nn.Module):
         matrices = [p for name, p in network.named_parameters() if p.ndim == 2 and "head" not in name]
@@ -88,11 +88,11 @@ class MuonAndAdam:
         muon, adam = Muon(matrices), torch.optim.Adam(others)
         self._parts: list[tuple[torch.optim.Optimizer, float]] = [(muon, MUON_RATE), (adam, 1.0)]
 
-    def step(self, rate: float) -> None:
-        """One update at the learning rate `rate`; the gradients are cleared."""
-        for part, times in self._parts:
+    def step(self, learning_rate: float) -> None:
+        """One update at `learning_rate`; the gradients are cleared."""
+        for part, factor in self._parts:
             for group in part.param_groups:
-                group["lr"] = times * rate
+                group["lr"] = factor * learning_rate
             part.step()
             part.zero_grad()
 

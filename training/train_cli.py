@@ -48,10 +48,12 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 @click.option(
     "--batch",
     type=click.IntRange(1),
-    help="Windows in a step.  [default: 64 cable, 128 pneumatic; 4 times as many on a GPU]",
+    help="Batch size: windows in a step.  [default: 64 cable, 128 pneumatic; 4 times as many on a GPU]",
 )
 @click.option("--learning-rate", default=3e-3, type=click.FloatRange(0, 1e6, min_open=True), help="Peak learning rate.")
-@click.option("--dropout", default=0.0, type=click.FloatRange(0, 1, max_open=True), help="Between the layers.")
+@click.option(
+    "--dropout", default=0.0, type=click.FloatRange(0, 1, max_open=True), help="Dropout probability between the layers."
+)
 @click.option(
     "--truncation-probability",
     type=click.FloatRange(0, 1),
@@ -65,15 +67,16 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
     "--split",
     default="blocks",
     type=click.Choice(["blocks", "shuffled"]),
-    help="Into training, validation and test part. blocks: contiguous in time, without overlap. shuffled: single "
-    "windows at random as in the paper; neighbouring windows overlap, so that the errors come out too small.",
+    help="Division into training, validation and test part. blocks: contiguous in time, without overlap. shuffled: "
+    "single windows at random as in the paper; neighbouring windows overlap, so that the errors come out too small.",
 )
-@click.option("--seed", default=0, type=click.IntRange(0), help="The same seed gives the same model.")
+@click.option("--seed", default=0, type=click.IntRange(0), help="Random seed; the same seed gives the same model.")
 @click.option(
     "--precision",
     default="float32",
     type=click.Choice(["float32", "bfloat16"]),
-    help="Of the network's products. bfloat16 is as accurate, and faster by half or more on processors with AMX.",
+    help="Number format of the network's products. bfloat16 is as accurate, and faster by half or more on processors "
+    "with AMX.",
 )
 @click.option(
     "--device",
@@ -82,7 +85,10 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
     help="auto: a GPU where torch finds one, else the CPU.",
 )
 @click.option(
-    "--threads", default=1, type=click.IntRange(1), help="More threads than idle cores are much slower than one thread."
+    "--threads",
+    default=1,
+    type=click.IntRange(1),
+    help="CPU threads; more threads than idle cores are much slower than one.",
 )
 @renamed_option("--rate", "--learning-rate")
 @renamed_option("--shorter", "--truncation-probability")

@@ -43,20 +43,20 @@ class Generation(msgspec.Struct):
     period_s: float | None = None
 
 
-def attributes(found: Mapping[str, Any], schema: int, where: Path) -> dict[str, Any]:
+def attributes(in_file: Mapping[str, Any], schema: int, where: Path) -> dict[str, Any]:
     """All of `ATTRIBUTES` of a file of this schema, or of schema 1, under their present names."""
-    is_old = "schema" in found and whole_number("schema", found["schema"], where) == 1
+    is_old = "schema" in in_file and whole_number("schema", in_file["schema"], where) == 1
     old_names = {new: old for old, new in SCHEMA_1.items()} if is_old else {}
     names = {name: old_names.get(name, name) for name in ATTRIBUTES}
     for name, name_in_file in names.items():
-        if name_in_file not in found:
+        if name_in_file not in in_file:
             raise ModelError(
                 f"{where}: not a data set of modsoft-collect: no attribute {name_in_file}, expected {ATTRIBUTES[name]}"
             )
-    of_file = whole_number("schema", found["schema"], where)
-    if of_file not in (1, schema):
-        raise ModelError(f"{where}: schema {of_file}, expected 1 or {schema}; collect it again, or update modsoft")
-    return {name: found[name_in_file] for name, name_in_file in names.items()}
+    found = whole_number("schema", in_file["schema"], where)
+    if found not in (1, schema):
+        raise ModelError(f"{where}: schema {found}, expected 1 or {schema}; collect it again, or update modsoft")
+    return {name: in_file[name_in_file] for name, name_in_file in names.items()}
 
 
 def whole_number(name: str, value: Any, where: Path) -> int:
@@ -72,8 +72,8 @@ def generation(value: Any, steps: int, where: Path) -> dict[str, Any]:
     can be read."""
     try:
         text = decoded(value) if isinstance(value, bytes) else value
-        found = json.loads(text)
-        required = msgspec.convert(found, Generation)
+        settings = json.loads(text)
+        required = msgspec.convert(settings, Generation)
     except (ValueError, TypeError, RecursionError, msgspec.ValidationError) as error:
         raise ModelError(
             f"{where}: its generation settings cannot be read ({error}); expected {ATTRIBUTES['generation']}"
@@ -90,46 +90,46 @@ def generation(value: Any, steps: int, where: Path) -> dict[str, Any]:
             f"{where}: period_s {required.period_s:g} in its generation settings, but hz of its robot means "
             f"{period_s:g}"
         )
-    return {SCHEMA_1_SETTINGS.get(name, name): setting for name, setting in found.items()}
+    return {SCHEMA_1_SETTINGS.get(name, name): setting for name, setting in settings.items()}
 
 
 def stage_borders(value: Any, steps: int, where: Path) -> NDArray[np.int64]:
     """First step of each stage, and the end (stages + 1,)."""
-    found = np.asarray(value)
-    is_list = found.ndim == 1 and len(found) >= 2 and found.dtype.kind in "iu"
-    if not is_list or found[0] != 0 or found[-1] != steps or not (found[1:] >= found[:-1]).all():
+    borders = np.asarray(value)
+    is_list = borders.ndim == 1 and len(borders) >= 2 and borders.dtype.kind in "iu"
+    if not is_list or borders[0] != 0 or borders[-1] != steps or not (borders[1:] >= borders[:-1]).all():
         raise ModelError(
             f"{where}: stage_borders {_short(value)}, expected whole numbers that rise from 0 to {steps}, the steps of "
             f"an episode; [0, {steps}] for a single stage"
         )
-    return found.astype(np.int64)
+    return borders.astype(np.int64)
 
 
 def shapes(configuration: tuple[int, ...], action: tuple[int, ...], robot: robots.Robot, where: Path) -> None:
     """The arrays' shapes, against the robot's and each other's."""
     episodes, steps = action[:2] if len(action) == 4 else (0, 0)
-    for name, found, expected, in_words in (
+    for name, shape, expected, in_words in (
         ("action", action, (episodes, steps, robot.modules, robot.action_size), "(episodes, steps, {1}, {2})"),
         ("configuration", configuration, (episodes, steps + 1, robot.modules, 3), "(episodes, steps + 1, {1}, 3)"),
     ):
-        if found != expected or 0 in found:
+        if shape != expected or 0 in shape:
             wanted = f"{expected}" if 0 not in expected else in_words.format(0, robot.modules, robot.action_size)
-            raise ModelError(f"{where}: {name} has the shape {found}, expected {wanted} for robot {robot.name}")
+            raise ModelError(f"{where}: {name} has the shape {shape}, expected {wanted} for robot {robot.name}")
 
 
-def configuration(found: Array, where: Path) -> None:
+def configuration(values: Array, where: Path) -> None:
     """Finite unit vectors (E, K + 1, N, 3), each episode from rest."""
-    _finite("configuration", found, where)
-    length = np.linalg.norm(found, axis=-1)
+    _finite("configuration", values, where)
+    length = np.linalg.norm(values, axis=-1)
     wrong = np.argwhere(np.abs(length - 1.0) > LENGTH_TOLERANCE)
     if len(wrong):
         episode, step, module = map(int, wrong[0])
-        vector = ", ".join(f"{value:g}" for value in found[episode, step, module])
+        vector = ", ".join(f"{value:g}" for value in values[episode, step, module])
         raise ModelError(
             f"{where}: configuration of episode {episode}, step {step}, module {module + 1} is [{vector}], of length "
             f"{length[episode, step, module]:.4g}; expected a unit vector [v_x, v_y, v_z]"
         )
-    bent_deg = np.degrees(np.arccos(np.clip(found[:, 0, :, 2], -1.0, 1.0)))
+    bent_deg = np.degrees(np.arccos(np.clip(values[:, 0, :, 2], -1.0, 1.0)))
     wrong = np.argwhere(bent_deg > REST_LIMIT_DEG)
     if len(wrong):
         episode, module = map(int, wrong[0])
@@ -140,21 +140,21 @@ def configuration(found: Array, where: Path) -> None:
         )
 
 
-def action(found: Array, where: Path) -> None:
+def action(values: Array, where: Path) -> None:
     """Finite actions (E, K, N, A) in [-1, 1]."""
-    _finite("action", found, where)
-    wrong = np.argwhere(np.abs(found) > 1.0 + RANGE_TOLERANCE)
+    _finite("action", values, where)
+    wrong = np.argwhere(np.abs(values) > 1.0 + RANGE_TOLERANCE)
     if len(wrong):
         episode, step, module, number = map(int, wrong[0])
         raise ModelError(
             f"{where}: action a_{number} of episode {episode}, step {step}, module {module + 1} is "
-            f"{found[episode, step, module, number]:g}; expected actions in [-1, 1]"
+            f"{values[episode, step, module, number]:g}; expected actions in [-1, 1]"
         )
 
 
-def _finite(name: str, found: Array, where: Path) -> None:
-    if not np.isfinite(found).all():
-        episode, step, module, _ = map(int, np.argwhere(~np.isfinite(found))[0])
+def _finite(name: str, values: Array, where: Path) -> None:
+    if not np.isfinite(values).all():
+        episode, step, module, _ = map(int, np.argwhere(~np.isfinite(values))[0])
         raise ModelError(
             f"{where}: {name} holds values that are not finite, first in episode {episode}, step {step}, "
             f"module {module + 1}"

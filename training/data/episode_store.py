@@ -59,10 +59,10 @@ class Shards:
         settings = self.folder / SETTINGS
         if settings.is_file():
             try:
-                found = json.loads(settings.read_bytes())  # JSON detects its encoding
+                of_episodes = json.loads(settings.read_bytes())  # JSON detects its encoding
             except (OSError, ValueError, RecursionError) as error:
                 raise ModelError(f"{settings}: cannot be read ({error}); delete its folder to start again") from error
-            refuse_other(found, generation, self.folder)
+            refuse_other(of_episodes, generation, self.folder)
             return
         if self.finished():
             raise ModelError(
@@ -78,7 +78,7 @@ class Shards:
         Lists the folder: a network file system caches that a file does not exist, and reports the same after another
         machine has written it.
         """
-        return {int(found[1]) for name in os.listdir(self.folder) if (found := EPISODE.fullmatch(name))}
+        return {int(match[1]) for name in os.listdir(self.folder) if (match := EPISODE.fullmatch(name))}
 
     def drop_damaged(self, configuration: tuple[int, ...], action: tuple[int, ...]) -> None:
         """Deletes episodes that cannot be read, are not finite, or whose arrays have other shapes than these."""
@@ -144,13 +144,13 @@ def _is_own(name: str) -> bool:
     return name in ("lock", SETTINGS) or any(each.fullmatch(name) for each in (EPISODE, STALE, JOBS))
 
 
-def refuse_other(found: dict[str, Any], generation: dict[str, Any], where: Path) -> None:
+def refuse_other(existing: dict[str, Any], generation: dict[str, Any], where: Path) -> None:
     """`ModelError` with the first difference of two generation settings."""
-    if not isinstance(found, dict):
+    if not isinstance(existing, dict):
         raise ModelError(f"{where}: its generation settings cannot be read; give another --out, or delete it")
-    differences = [key for key in generation if found.get(key) != generation[key]]
+    differences = [key for key in generation if existing.get(key) != generation[key]]
     if differences:
         key = differences[0]
         is_short = not isinstance(generation[key], dict)
-        what = f"{key} {found.get(key)}, expected {generation[key]}" if is_short else f"another {key}"
+        what = f"{key} {existing.get(key)}, expected {generation[key]}" if is_short else f"another {key}"
         raise ModelError(f"{where}: begun with {what}; give another --out, or delete it")
