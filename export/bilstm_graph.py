@@ -1,8 +1,8 @@
-"""The biLSTM unit as an ONNX graph over a segment of contiguous modules, built node by node.
+"""ONNX graph of the biLSTM over a segment of contiguous modules.
 
-Standard operators, one bidirectional LSTM node a layer; it opens in a viewer as the paper's Figure 1-(D). The states
-that arrive from the two neighbours are inputs with zero defaults, so that an end of the robot feeds nothing and the
-whole robot is one run. (Tracing torch freezes the number of modules at the traced one.)
+Standard operators, one bidirectional LSTM node for each layer, as in Figure 1-(D) of the paper. The states from the two
+neighbours are inputs with zero defaults, which apply at the ends of the robot, so that one run covers the whole robot.
+(A trace of torch would fix the number of modules.)
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ DIRECTIONS = ("", "_reverse")  # torch's suffixes: base to tip, tip to base
 
 
 def weights_of(model: onnx.ModelProto, sizes: Network) -> Weights:
-    """The state dict read back out of a graph of `build`, bit for bit. KeyError where one is missing."""
+    """The state dict of a graph, bit for bit. KeyError for a missing weight."""
     if sizes.modules is not None:
         return fixed_graph.weights_of(model, sizes)
     return nodes.weights_of(model, sizes.layers, DIRECTIONS)
 
 
 def build(weights: Weights, sizes: Network, description: str) -> onnx.ModelProto:
-    """State dict of a network, float32, to the model; `description` is its metadata, JSON text. Networks bound to a
-    number of modules get the graphs of `bound_graph`."""
+    """Builds the model from a state dict, float32; description: metadata, JSON text. Networks with a fixed number of
+    modules are built by `fixed_graph`."""
     if sizes.modules is not None:
         return fixed_graph.build(weights, sizes, description)
     layers, hidden = sizes.layers, sizes.hidden
     graph = Nodes()
     graph.constants |= nodes.initializers(weights, layers, DIRECTIONS)
 
-    # z is 0 while every input is finite, and NaN otherwise: an LSTM kernel may turn a NaN into a plausible actuation.
+    # 0 if all inputs are finite, else NaN: an LSTM kernel may turn a NaN into a plausible actuation.
     received = graph.add("Concat", FROM_NEIGHBOURS, "received", axis=0)  # (4 L, 1, H)
     graph.add("ReduceSum", [FEATURES], "sum_of_features", keepdims=0)
     graph.add("ReduceSum", [received], "sum_of_received", keepdims=0)
     graph.add("Add", ["sum_of_features", "sum_of_received"], "sum_of_inputs")
-    guard = graph.add("Sub", ["sum_of_inputs", "sum_of_inputs"], "nan_guard")
+    nan_term = graph.add("Sub", ["sum_of_inputs", "sum_of_inputs"], "nan_guard")
 
     sequence_shape = graph.whole_numbers("sequence_shape", [-1, 1, sizes.feature_size])
     sequence = graph.add("Reshape", [FEATURES, sequence_shape], "layer_0")  # (N, 1, F)
@@ -64,10 +64,10 @@ def build(weights: Weights, sizes: Network, description: str) -> onnx.ModelProto
     graph.add("MatMul", [sequence, "head_weight"], "head_product")
     graph.add("Add", ["head_product", "head_bias"], "head")  # (N, 1, A)
     graph.add("Reshape", ["head", graph.whole_numbers("actuation_shape", [1, -1, sizes.action_size])], "unguarded")
-    graph.add("Add", ["unguarded", guard], ACTUATION)
+    graph.add("Add", ["unguarded", nan_term], ACTUATION)
 
     graph.add("Concat", final_h + final_c, "final_states", axis=0)  # (4 L, 1, H): h, then c; by layer: tip, base
-    sent = graph.add("Add", ["final_states", guard], "sent")
+    sent = graph.add("Add", ["final_states", nan_term], "sent")
     for name in TO_NEIGHBOURS:
         first = 2 * layers * name.startswith("c") + name.endswith("base")
         rows = graph.whole_numbers(f"{name}_rows", [first + 2 * layer for layer in range(layers)])

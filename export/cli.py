@@ -1,4 +1,4 @@
-"""`modsoft-export`: a checkpoint to a checked model file, or all that stands in one."""
+"""`modsoft-export`: from a checkpoint to a verified model file, or the content of a model file."""
 
 from __future__ import annotations
 
@@ -13,17 +13,15 @@ from modsoft.runtime.errors import UsageError
 @click.command("modsoft-export")
 @click.argument("model", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="Model file to write.  [default: MODEL with .onnx]")
-@click.option(
-    "--meta", type=click.Path(path_type=Path), help="TOML that says what a bare state dict cannot; see below."
-)
-@click.option("--inspect", is_flag=True, help="Print all that stands in the ONNX file MODEL, proven first.")
+@click.option("--meta", type=click.Path(path_type=Path), help="TOML with what a bare state dict lacks; see below.")
+@click.option("--inspect", is_flag=True, help="Verify the ONNX file MODEL and print its content.")
 def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None:
     """Export the trained network MODEL (model.pt of modsoft-train) to ONNX, for modsoft-runtime.
 
-    The file holds one module's unit, which serves robots of any number of modules. It is compared with torch for 2 to
-    8, 16 and 64 modules before it gets its name (beyond 4 only where float32 is accurate enough over so many to tell);
-    when any check fails nothing is written and the exit code is 65. (The networks lstm and module-lstm are bound to
-    their number of modules and compared for that.)
+    The file contains the unit of one module, for robots of any number of modules. Before it is written, it is compared
+    with torch for 2 to 8, 16 and 64 modules (beyond 4 only if float32 is accurate enough for a comparison); if a check
+    fails, nothing is written and the exit code is 65. The networks lstm and module-lstm have a fixed number of modules
+    and are compared for that.
 
     \b
     Examples:
@@ -32,19 +30,18 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
       modsoft-export --inspect model.onnx
 
     \b
-    The TOML for --meta, for weights of another training: a state dict, or a checkpoint that holds one under any key
-    (state_dict, ...), with any prefix before its names and in any float type. All but weights and [provenance] is
-    required:
-      robot = "pneumatic-3"            # a robot file, or the name of one that ships
+    The TOML for --meta, for weights of another training: a state dict, or a checkpoint with one under any key
+    (state_dict, ...), with any prefix of its names and any float type. Required, except for weights and [provenance]:
+      robot = "pneumatic-3"            # a robot file, or the name of a shipped robot
       history = 10                     # time steps T
-      label = "base -1, tip +1"        # the one convention that is accepted
+      label = "base -1, tip +1"        # the only accepted convention
       features = "states and actions by time step, then label"
-      weights = "state_dict"           # which, in a checkpoint that holds several
-      [provenance]                     # anything worth keeping
+      weights = "state_dict"           # key, in a checkpoint with several
+      [provenance]                     # any entries
     """
     if inspect:
         if out is not None or meta is not None:
-            raise UsageError("--inspect writes nothing, so it takes no --out and no --meta")
+            raise UsageError("--inspect writes nothing; leave out --out and --meta")
         from modsoft.export.inspect import print_model
 
         print_model(model)
@@ -53,18 +50,20 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
     from modsoft.export.write import export
 
     exported = export(model, out, meta)
-    report, said = exported.report, exported.description
-    click.echo(f"{exported.path}: {exported.path.stat().st_size / 1e6:.1f} MB, SHA-256 {said.file_sha256}")
-    modules = ", ".join(map(str, said.modules_trained_on))
-    bound = "" if said.network.modules is None else " and bound to them"
-    click.echo(f"for {said.kind} robots at {1.0 / said.period_s:g} Hz, trained on {modules} modules{bound}")
+    report, description = exported.report, exported.description
+    click.echo(f"{exported.path}: {exported.path.stat().st_size / 1e6:.1f} MB, SHA-256 {description.file_sha256}")
+    modules = ", ".join(map(str, description.modules_trained_on))
+    fixed = "" if description.network.modules is None else ", fixed"
     click.echo(
-        f"largest difference from torch, share of the output range (at most {report.bound:.1e}; "
-        f"torch's own in float32 {report.torch_error:.1e}):"
+        f"for {description.kind} robots at {1.0 / description.period_s:g} Hz, trained on {modules} modules{fixed}"
     )
-    if said.network.modules is None and (left := set(parity.MODULES) - set(report.fused)):
-        over = ", ".join(map(str, sorted(left)))
-        click.echo(f"not compared over {over} modules: there this network amplifies float32's rounding too much")
+    click.echo(
+        f"largest difference from torch, relative to the output range (limit {report.bound:.1e}; "
+        f"of torch in float32 {report.torch_error:.1e}):"
+    )
+    if description.network.modules is None and (skipped := set(parity.MODULES) - set(report.fused)):
+        numbers = ", ".join(map(str, sorted(skipped)))
+        click.echo(f"not compared for {numbers} modules: this network amplifies the rounding of float32 too much")
     click.echo("  modules     " + "".join(f"{modules:>10}" for modules in report.fused))
     for name, errors in (
         ("one run", report.fused),
@@ -74,7 +73,7 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
         if errors:
             click.echo(f"  {name:<12}" + "".join(f"{error:>10.1e}" for error in errors.values()))
     if report.one_sweep_fewer:
-        click.echo("  (sweep short: the chain with one sweep left out: it has to be far off for the check to count)")
+        click.echo("  (sweep short: the chain without its last sweep, whose error must be large for a valid check)")
 
 
 main = entry(cli)

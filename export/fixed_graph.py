@@ -1,6 +1,6 @@
-"""The networks whose sequence is time as ONNX graphs: LSTM, all modules in one unit, and one LSTM a module.
+"""ONNX graphs of the networks whose sequence is time: LSTM (all modules in one), and one LSTM for each module.
 
-Both are bound to their number of modules N. Standard operators, one LSTM node a layer and unit.
+Both have a fixed number of modules N. Standard operators, one LSTM node for each layer and unit.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ DIRECTIONS = ("",)  # torch's suffix: forward in time
 
 
 def _prefixes(sizes: Network) -> list[str]:
-    """Of each unit's weights in the state dict: one unit with all modules, or one a module, base first."""
+    """Prefixes in the state dict of each unit: one for all modules, or one for each module, base first."""
     return [""] if sizes.name == "lstm" else [f"networks.{i}." for i in range(sizes.modules or 0)]
 
 
 def weights_of(model: onnx.ModelProto, sizes: Network) -> Weights:
-    """The state dict read back out of a graph, bit for bit. KeyError where one is missing."""
+    """The state dict of a graph, bit for bit. KeyError for a missing weight."""
     weights: Weights = {}
     for prefix in _prefixes(sizes):
         weights |= nodes.weights_of(model, sizes.layers, DIRECTIONS, prefix)
@@ -28,7 +28,7 @@ def weights_of(model: onnx.ModelProto, sizes: Network) -> Weights:
 
 
 def build(weights: Weights, sizes: Network, description: str) -> onnx.ModelProto:
-    """State dict of `LSTM` or `ModuleLSTM`, float32, to the model; `description` is its metadata, JSON text."""
+    """Builds the model from the state dict, float32, of `LSTM` or `ModuleLSTM`; description: metadata, JSON text."""
     modules, units = sizes.modules, _prefixes(sizes)
     if modules is None:
         raise ValueError(f"{sizes.name} without its number of modules")
@@ -36,9 +36,9 @@ def build(weights: Weights, sizes: Network, description: str) -> onnx.ModelProto
     slot_size = label // sizes.history  # S + A
     graph = Nodes()
 
-    # 0 while every feature is finite, and NaN otherwise: an LSTM kernel may turn a NaN into a plausible actuation.
+    # 0 if all features are finite, else NaN: an LSTM kernel may turn a NaN into a plausible actuation.
     graph.add("ReduceSum", [FEATURES], "sum_of_features", keepdims=0)
-    guard = graph.add("Sub", ["sum_of_features", "sum_of_features"], "nan_guard")
+    nan_term = graph.add("Sub", ["sum_of_features", "sum_of_features"], "nan_guard")
 
     ends = [graph.whole_numbers(name, [value]) for name, value in (("first", 0), ("label", label), ("axis", 2))]
     graph.add("Slice", [FEATURES, *ends], "window")  # (1, N, T (S + A))
@@ -68,7 +68,7 @@ def build(weights: Weights, sizes: Network, description: str) -> onnx.ModelProto
     graph.add("Concat", [f"{prefix}head" for prefix in units], "heads", axis=1)  # (1, N A)
     actuation_shape = (1, modules, sizes.action_size)
     graph.add("Reshape", ["heads", graph.whole_numbers("actuation_shape", list(actuation_shape))], "unguarded")
-    graph.add("Add", ["unguarded", guard], ACTUATION)
+    graph.add("Add", ["unguarded", nan_term], ACTUATION)
     return graph.model(
         sizes.name.replace("-", "_"),
         {FEATURES: (1, modules, sizes.feature_size)},

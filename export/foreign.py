@@ -1,4 +1,4 @@
-"""The biLSTM's weights in checkpoints of other trainings: nested under a key, with a prefix, in another precision."""
+"""Weights of a biLSTM from checkpoints of other trainings: nested under a key, with a prefix, in any precision."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from modsoft.runtime.errors import ModelError
 
 Weights = dict[str, torch.Tensor]
 
-ANCHOR = "lstm.weight_hh_l0"  # what stands before it in its name stands before every name
-DEPTH = 4  # of the dicts in a checkpoint
+ANCHOR = "lstm.weight_hh_l0"  # its prefix is the prefix of all names
+DEPTH = 4  # of nested dicts
 
 
 def state_dicts(content: Any, key: str = "", depth: int = DEPTH) -> Iterator[tuple[str, Weights]]:
-    """(key, state dict) of every biLSTM in a checkpoint; the key is empty for the checkpoint itself, "a.b" for one in
-    a dict in a dict."""
+    """(key, state dict) of every biLSTM in a checkpoint. The key is empty for the checkpoint itself, "a.b" for a nested
+    dict."""
     if not isinstance(content, dict):
         return
     names = {name: value for name, value in content.items() if isinstance(name, str)}
@@ -30,68 +30,66 @@ def state_dicts(content: Any, key: str = "", depth: int = DEPTH) -> Iterator[tup
 
 
 def weights_of(content: dict[str, Any], key: str | None, where: Path) -> Weights:
-    """The biLSTM's weights, float32, under the names of modsoft-train. `key`: which, as in `state_dicts`, None where
-    there is only one. `ModelError` where there is none, or a network of another kind."""
-    found = dict(state_dicts(content))
-    keys = ", ".join(repr(each) for each in found if each)
-    if key is not None and key not in found:
-        raise ModelError(f"{where}: no state dict of a biLSTM under {key!r}; {_held(content, keys)}")
-    if not found:
+    """Weights of the biLSTM, float32, with the names of modsoft-train. key: as in `state_dicts`, None for the only one.
+    `ModelError` if there is none, or another network."""
+    candidates = dict(state_dicts(content))
+    keys = ", ".join(repr(each) for each in candidates if each)
+    if key is not None and key not in candidates:
+        raise ModelError(f"{where}: no state dict of a biLSTM under {key!r}; {_content(content, keys)}")
+    if not candidates:
         raise ModelError(
             f"{where}: neither a checkpoint of modsoft-train nor the state dict of a biLSTM ({ANCHOR}, ..., "
-            f"head.weight, head.bias); {_held(content, keys)}; save such a one: torch.save(network.state_dict(), FILE)"
+            f"head.weight, head.bias); {_content(content, keys)}; save one: torch.save(network.state_dict(), FILE)"
         )
-    if key is None and len(found) > 1:
-        first = next(iter(found))
+    if key is None and len(candidates) > 1:
+        first = next(iter(candidates))
         raise ModelError(
             f"{where}: state dicts of biLSTMs under {keys}; choose one in the TOML of --meta, such as "
             f'weights = "{first}"'
         )
-    held = found[key] if key is not None else next(iter(found.values()))
-    prefixes = [name.removesuffix(ANCHOR) for name in held if name.endswith(ANCHOR)]
+    chosen = candidates[key] if key is not None else next(iter(candidates.values()))
+    prefixes = [name.removesuffix(ANCHOR) for name in chosen if name.endswith(ANCHOR)]
     if len(prefixes) > 1:
         raise ModelError(
             f"{where}: several networks in one state dict, under {', '.join(map(repr, prefixes))}; save "
-            "that of the biLSTM alone: torch.save(network.state_dict(), FILE)"
+            "only that of the biLSTM: torch.save(network.state_dict(), FILE)"
         )
-    own = {name.removeprefix(prefixes[0]): value for name, value in held.items() if name.startswith(prefixes[0])}
+    own = {name.removeprefix(prefixes[0]): value for name, value in chosen.items() if name.startswith(prefixes[0])}
     _check_names(own, where)
     return {name: value.detach().float() for name, value in own.items()}
 
 
-def refuse(content: dict[str, Any], where: Path, untold: str) -> NoReturn:
-    """`ModelError` with what a checkpoint holds and how to export it; `untold`: what has to be added to the weights."""
+def refuse(content: dict[str, Any], where: Path, missing: str) -> NoReturn:
+    """Raises `ModelError` with the content of a checkpoint and how to export it. missing: what the weights lack."""
     if "identity" in content and {"optimizer", "optimiser"} & content.keys():  # "optimiser": version 0.1.0
-        raise ModelError(f"{where}: the state of a training that has not ended; start modsoft-train again to end it")
-    weights_of(content, None, where)  # another network is not exported with --meta either
+        raise ModelError(f"{where}: the state of a training that has not ended; run modsoft-train again to finish it")
+    weights_of(content, None, where)  # refuses other networks, which --meta does not help
     (key,) = (key for key, _ in state_dicts(content))
     what = f"a checkpoint of another training, with a state dict under {key!r}" if key else "a bare state dict"
-    raise ModelError(
-        f"{where}: {what}; its shapes cannot tell {untold}; say them in a TOML file: --meta FILE (--help shows one)"
-    )
+    raise ModelError(f"{where}: {what}; it lacks {missing}; set them in a TOML file: --meta FILE (see --help)")
 
 
-def _held(content: dict[str, Any], keys: str) -> str:
+def _content(content: dict[str, Any], keys: str) -> str:
     names = [repr(name) for name in content][:5]
     rest = ", ..." if len(content) > 5 else ""
     return f"found one under {keys}" if keys else f"found {', '.join(names) or 'nothing'}{rest}"
 
 
 def _check_names(weights: Weights, where: Path) -> None:
-    """`ModelError` unless the names are exactly those of a biLSTM of some layers, and all are floats."""
+    """`ModelError` unless names, types and dimensions are those of a biLSTM."""
     layers = sum(name.startswith("lstm.weight_hh_l") and not name.endswith("_reverse") for name in weights)
     parts = [
-        f"{part}_l{layer}{way}"
+        f"{part}_l{layer}{direction}"
         for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
         for layer in range(layers)
-        for way in ("", "_reverse")
+        for direction in ("", "_reverse")
     ]
     expected = {"head.weight", "head.bias", *(f"lstm.{part}" for part in parts)}
-    for word, names in (("no", expected - weights.keys()), ("further", weights.keys() - expected)):
+    for label, names in (("no", expected - weights.keys()), ("further", weights.keys() - expected)):
         if names:
             listed = ", ".join(sorted(names)[:4]) + (", ..." if len(names) > 4 else "")
             raise ModelError(
-                f"{where}: {word} {listed} in the state dict: not the biLSTM of Table S1 (torch.nn.LSTM `lstm`, "
+                f"{where}: {label} {listed} in the state dict: not the biLSTM of Table S1 (torch.nn.LSTM `lstm`, "
                 "bidirectional, and torch.nn.Linear `head`), the only network that is exported without modsoft-train"
             )
     for name, value in weights.items():

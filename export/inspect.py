@@ -1,4 +1,4 @@
-"""All that stands in a model file, for a person."""
+"""Printing of the content of a model file."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from modsoft.runtime.entry_point import printable
 
 
 def print_model(path: Path) -> None:
-    """Proves the file as the runtime does (`ModelError` otherwise), then prints its graph and its description."""
-    said = Model.load(path).description
+    """Verifies the file as the runtime does (`ModelError`), then prints its graph and its description."""
+    description = Model.load(path).description
     model = onnx.load(path, load_external_data=False)
     operators = Counter(node.op_type for node in model.graph.node)
     print(f"{path}: {path.stat().st_size} bytes; checksum, description and golden pairs are valid")
     print(f"graph: IR version {model.ir_version}, opset {model.opset_import[0].version}, {operators.total()} nodes")
     print(f"  operators: {', '.join(f'{count} {name}' for name, count in sorted(operators.items()))}")
     defaults = {tensor.name for tensor in model.graph.initializer}
-    for way, values in (("in ", model.graph.input), ("out", model.graph.output)):
+    for direction, values in (("in ", model.graph.input), ("out", model.graph.output)):
         for value in values:
             shape = ", ".join(d.dim_param or str(d.dim_value) for d in value.type.tensor_type.shape.dim)
-            print(f"  {way} {value.name} [{shape}]{' default 0' if value.name in defaults else ''}")
-    plain = msgspec.to_builtins(said)
+            print(f"  {direction} {value.name} [{shape}]{' default 0' if value.name in defaults else ''}")
+    plain = msgspec.to_builtins(description)
     golden = plain.pop("golden")
     _print_table(plain, 0)
     for pair in golden:

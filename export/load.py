@@ -1,4 +1,4 @@
-"""What is exported: a checkpoint of modsoft-train, or a bare state dict with a meta file that says the rest."""
+"""Input of the export: a checkpoint of modsoft-train, or a state dict with a meta file."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ from modsoft.runtime.files import read_text
 from modsoft.runtime.robot import Robot
 from modsoft.training import checkpoint as checkpoints
 
-UNTOLD = (
+META_KEYS = (
     "robot (file or shipped name: kind, period, modules trained on), history (time steps T), label (base-to-tip), "
     "feature order (kind)"
 )
 
 
 class MetaFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """TOML beside a bare state dict: what the shapes of its tensors cannot tell."""
+    """TOML for a bare state dict: what its tensors do not contain."""
 
     robot: str  # a robot file, relative to the meta file, or a shipped robot's name
     history: int
     label: Literal["base -1, tip +1"]
     features: Literal["states and actions by time step, then label"]
-    weights: str | None = None  # which state dict of a checkpoint that holds several, such as "ema.state_dict"
+    weights: str | None = None  # key in a checkpoint with several state dicts, such as "ema.state_dict"
     provenance: dict[str, Any] = {}
 
 
 def read(path: Path, meta: Path | None = None) -> dict[str, Any]:
-    """The checkpoint at `path`, checked against itself; with `meta`, one made of a bare state dict."""
+    """Reads and checks the checkpoint at `path`, or with `meta` one made from a bare state dict. `ModelError`."""
     if meta is None:
         content = checkpoints.read(path)
         if len(content.keys() & checkpoints.KEYS.keys()) < len(checkpoints.KEYS) - 1:
-            foreign.refuse(content, path, UNTOLD)
-        found = checkpoints.load(path)
+            foreign.refuse(content, path, META_KEYS)
+        checkpoint = checkpoints.load(path)
     else:
-        found = _with_meta(path, meta)
-    _check(found, path)
-    return found
+        checkpoint = _with_meta(path, meta)
+    _check(checkpoint, path)
+    return checkpoint
 
 
 def files_of(meta: Path) -> list[Path]:
-    """What is read with --meta: that file, and the robot file that it names, if any."""
+    """The files that --meta reads: the meta file, and its robot file, which may not exist."""
     return [meta, meta.parent / _meta(meta).robot]
 
 
@@ -57,11 +57,11 @@ def _meta(meta: Path) -> MetaFile:
     try:
         return msgspec.convert(tomllib.loads(read_text(meta)), MetaFile)
     except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ModelError(f"{meta}: {error}; expected {UNTOLD}") from error
+        raise ModelError(f"{meta}: {error}; expected {META_KEYS}") from error
 
 
 def _robot(meta: Path, name: str) -> Robot:
-    """The robot file that a meta file names, which is beside it, or a shipped robot."""
+    """The robot of a meta file: a file relative to it, or a shipped robot."""
     path = meta.parent / name
     if path.is_file():
         return robots.load(path)
@@ -72,13 +72,13 @@ def _robot(meta: Path, name: str) -> Robot:
 
 
 def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
-    said = _meta(meta)
+    options = _meta(meta)
     content = checkpoints.read(path)
     if content.keys() >= checkpoints.KEYS.keys():
-        raise ModelError(f"{path}: a checkpoint that says all itself, expected a bare state dict; leave --meta out")
-    weights = foreign.weights_of(content, said.weights, path)
+        raise ModelError(f"{path}: found a complete checkpoint, expected a bare state dict; leave --meta out")
+    weights = foreign.weights_of(content, options.weights, path)
     layers = sum(name.startswith("lstm.weight_hh_l") and not name.endswith("_reverse") for name in weights)
-    robot = _robot(meta, said.robot)
+    robot = _robot(meta, options.robot)
     return {
         "schema": checkpoints.SCHEMA,
         "robot": robot.to_dict(),
@@ -89,43 +89,43 @@ def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
             "layers": layers,
             "hidden": weights["lstm.weight_hh_l0"].shape[1],
             "dropout": 0.0,
-            "history": said.history,
+            "history": options.history,
         },
-        "features": feature_names(robot.kind, said.history),
+        "features": feature_names(robot.kind, options.history),
         "weights": weights,
-        "provenance": said.provenance,
+        "provenance": options.provenance,
     }
 
 
 def network_of(checkpoint: dict[str, Any], where: str = "checkpoint") -> Network:
-    """Which network the checkpoint says it holds, and its sizes; `ModelError` for one that is not exported."""
+    """The network of a checkpoint and its sizes; `ModelError` for a network that is not exported."""
     try:
-        found = {name: value for name, value in checkpoint["network"].items() if name in Network.__struct_fields__}
-        return msgspec.convert(found, Network)
+        sizes = {name: value for name, value in checkpoint["network"].items() if name in Network.__struct_fields__}
+        return msgspec.convert(sizes, Network)
     except (AttributeError, msgspec.ValidationError) as error:
         raise ModelError(f"{where}: network: {error}; expected a network of modsoft-train and its sizes") from error
 
 
 def _check(checkpoint: dict[str, Any], path: Path) -> None:
-    """What the checkpoint says of itself holds together, and its weights are finite float32."""
+    """`ModelError` unless the checkpoint is consistent and its weights are finite float32."""
     try:
         robot = robots.from_dict(checkpoint["robot"], f"{path}: robot")
-    except RobotFileError as error:  # of this file, not of a robot file that the user can mend
+    except RobotFileError as error:  # in this file, not in a robot file that the user can correct
         raise ModelError(f"{error}; train it again with this version") from error
     network = network_of(checkpoint, str(path))
     kind, history = robot.kind, network.history
-    bound = None if network.name == "bilstm" else robot.modules
-    if network.modules != bound:
-        raise ModelError(f"{path}: {network.name} of {network.modules} modules, expected {bound}; train it again")
+    fixed = None if network.name == "bilstm" else robot.modules
+    if network.modules != fixed:
+        raise ModelError(f"{path}: {network.name} of {network.modules} modules, expected {fixed}; train it again")
     expected = feature_names(kind, history)
     if list(checkpoint["features"]) != expected:
         raise ModelError(f"{path}: features {list(checkpoint['features'])}, expected for {kind} {expected}")
-    for name, found, wanted in (
+    for name, size, required in (
         ("feature_size", network.feature_size, len(expected)),
         ("action_size", network.action_size, robot.action_size),
     ):
-        if found != wanted:
-            raise ModelError(f"{path}: {name} {found}, expected {wanted} for {kind} and history {history}")
+        if size != required:
+            raise ModelError(f"{path}: {name} {size}, expected {required} for {kind} and history {history}")
     for name, tensor in checkpoint["weights"].items():
         if tensor.dtype != torch.float32:
             raise ModelError(f"{path}: weight {name} is {tensor.dtype}, expected torch.float32")

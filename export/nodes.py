@@ -1,4 +1,4 @@
-"""What the graphs are built with: nodes and constants, and an LSTM's weights between torch's order and ONNX's."""
+"""Building of ONNX graphs: nodes, constants, and the weights of an LSTM in the order of torch and of ONNX."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from modsoft.runtime.control.model_file import IR_VERSION, METADATA_KEY, OPSET
 
 Weights = dict[str, NDArray[np.float32]]
 TORCH_GATES, ONNX_GATES = "ifco", "iofc"  # order of the four gates' rows: input, output, forget, cell
-PARTS = (("W", ["weight_ih"]), ("R", ["weight_hh"]), ("B", ["bias_ih", "bias_hh"]))  # ONNX's name, torch's
+PARTS = (("W", ["weight_ih"]), ("R", ["weight_hh"]), ("B", ["bias_ih", "bias_hh"]))  # names of ONNX and torch
 
 
 class Nodes:
-    """A graph in the making."""
+    """Nodes and constants of a graph under construction."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[str, NDArray] = {}
 
     def add(self, op: str, inputs: Sequence[str], outputs: str | list[str], **attributes: Any) -> str:
-        """Adds a node; gives the name of its first output."""
+        """Adds a node; returns the name of its first output."""
         outputs = [outputs] if isinstance(outputs, str) else outputs
         self.nodes.append(helper.make_node(op, inputs, outputs, name=f"{op}:{outputs[0]}", **attributes))
         return outputs[0]
 
     def whole_numbers(self, name: str, values: int | list[int]) -> str:
-        """Adds a constant: a shape, rows, an axis."""
+        """Adds an int64 constant (a shape, indices, an axis); returns its name."""
         self.constants[name] = np.array(values, dtype=np.int64)
         return name
 
@@ -43,8 +43,8 @@ class Nodes:
         description: str,
         what: str,
     ) -> onnx.ModelProto:
-        """The whole as a model: inputs and outputs with their shapes, float32 all; `description` is its metadata, JSON
-        text, `what` a line for a person who opens it in a viewer."""
+        """The model. inputs, outputs: names and shapes, float32; description: metadata, JSON text; what: comment of the
+        graph, for viewers."""
 
         def values(shapes: Mapping[str, tuple[int | str, ...]]) -> list[onnx.ValueInfoProto]:
             return [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in shapes.items()]
@@ -57,43 +57,43 @@ class Nodes:
         return model
 
 
-def _regated(rows: NDArray[np.float32], old: str, new: str) -> NDArray[np.float32]:
-    """Rows of four gates (4 H, ...) from one order of gates to another."""
+def _reordered(rows: NDArray[np.float32], old: str, new: str) -> NDArray[np.float32]:
+    """Reorders the rows of four gates (4 H, ...)."""
     gates = dict(zip(old, np.split(rows, 4), strict=True))
     return np.concatenate([gates[gate] for gate in new])
 
 
 def initializers(weights: Weights, layers: int, directions: Sequence[str], prefix: str = "") -> Weights:
-    """The part of torch's state dict under `prefix` to a graph's weights: W (D, 4 H, in), R (D, 4 H, H) and B (D, 8 H)
-    a layer, and the head. directions: torch's suffixes, D of them."""
-    found: Weights = {}
+    """Weights of a graph from torch's state dict under `prefix`: W (D, 4 H, in), R (D, 4 H, H) and B (D, 8 H) of each
+    layer, and the head. directions: torch's D suffixes."""
+    tensors: Weights = {}
     for layer in range(layers):
         for name, parts in PARTS:
-            found[f"{prefix}layer_{layer + 1}_{name}"] = np.stack(
+            tensors[f"{prefix}layer_{layer + 1}_{name}"] = np.stack(
                 [
                     np.concatenate(
                         [
-                            _regated(weights[f"{prefix}lstm.{part}_l{layer}{direction}"], TORCH_GATES, ONNX_GATES)
+                            _reordered(weights[f"{prefix}lstm.{part}_l{layer}{direction}"], TORCH_GATES, ONNX_GATES)
                             for part in parts
                         ]
                     )
                     for direction in directions
                 ]
             )
-    found[f"{prefix}head_weight"] = np.ascontiguousarray(weights[f"{prefix}head.weight"].T)
-    found[f"{prefix}head_bias"] = weights[f"{prefix}head.bias"]
-    return found
+    tensors[f"{prefix}head_weight"] = np.ascontiguousarray(weights[f"{prefix}head.weight"].T)
+    tensors[f"{prefix}head_bias"] = weights[f"{prefix}head.bias"]
+    return tensors
 
 
 def weights_of(model: onnx.ModelProto, layers: int, directions: Sequence[str], prefix: str = "") -> Weights:
-    """The state dict read back out of a graph: the inverse of `initializers`. KeyError where one is missing."""
+    """The state dict of a graph: the inverse of `initializers`. KeyError for a missing weight."""
     stored = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     weights: Weights = {}
     for layer in range(layers):
         for name, parts in PARTS:
             for direction, rows in zip(directions, stored[f"{prefix}layer_{layer + 1}_{name}"], strict=True):
                 for part, half in zip(parts, np.split(rows, len(parts)), strict=True):
-                    weights[f"{prefix}lstm.{part}_l{layer}{direction}"] = _regated(half, ONNX_GATES, TORCH_GATES)
+                    weights[f"{prefix}lstm.{part}_l{layer}{direction}"] = _reordered(half, ONNX_GATES, TORCH_GATES)
     weights[f"{prefix}head.weight"] = stored[f"{prefix}head_weight"].T
     weights[f"{prefix}head.bias"] = stored[f"{prefix}head_bias"]
     return weights

@@ -1,4 +1,4 @@
-"""From a checkpoint to a model file: written under a temporary name, checked as read back from there, then renamed."""
+"""Export of a checkpoint to a model file, which is verified under a temporary name and then renamed."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.files import check_not_input, check_writable, written
 from modsoft.training import checkpoint as checkpoints
 
-GOLDEN_MODULES = (2, 4)  # where the network takes any number
+GOLDEN_MODULES = (2, 4)  # for a network for any number
 
 
 @dataclass(frozen=True)
 class Exported:
-    """A model file that passed every check."""
+    """A verified model file."""
 
     path: Path
     description: Description
@@ -33,8 +33,8 @@ class Exported:
 def export(model: str | Path, out: str | Path | None = None, meta: str | Path | None = None) -> Exported:
     """Exports the checkpoint `model` to `out`, by default `model.onnx` beside it.
 
-    Raises `ModelError` when the checkpoint or the file made of it fails a check; then nothing is left, and a file
-    that stood at `out` before stands there still.
+    Raises `ModelError` if the checkpoint or the exported file fails a check; an existing file at `out` is then left
+    unchanged. `UsageError` and `OutputError` for an unsuitable `out`.
     """
     model = Path(model)
     out, is_default = (model.with_suffix(".onnx"), True) if out is None else (Path(out), False)
@@ -52,29 +52,29 @@ def export(model: str | Path, out: str | Path | None = None, meta: str | Path | 
     try:
         text = msgspec.json.encode(described).decode()
     except TypeError as error:
-        raise ModelError(f"{model}: provenance that is no plain value ({error})") from error
+        raise ModelError(f"{model}: provenance with a value that JSON does not have ({error})") from error
     content = model_file.with_checksum(bilstm_graph.build(weights, sizes, text).SerializeToString())
 
     with written(out) as temporary:
         temporary.write_bytes(content)
         try:
             report = parity.verify(temporary, network, sizes, expected)
-            described = Model.load(temporary).description  # as the lab PC will, golden pairs included
+            described = Model.load(temporary).description  # as at the start of a run
         except ModelError as error:
             raise ModelError(f"{out} not written: {str(error).replace(str(temporary), out.name)}") from error
     return Exported(out, described, report)
 
 
 def _check_own(out: Path) -> None:
-    """`UsageError` where a file that the user did not name as output is no model of modsoft-export."""
+    """`UsageError` if the file at the default output is not a model of modsoft-export."""
     try:
         model_file.read(out)
     except ModelError as error:
-        raise UsageError(f"{out}: exists, and is no model of modsoft-export; give --out {out}, or delete it") from error
+        raise UsageError(f"{out}: exists, not a model of modsoft-export; give --out {out}, or delete it") from error
 
 
 def describe(checkpoint: dict[str, Any], sizes: Network, weights: Weights, expected: parity.Reference) -> Description:
-    """The description of the model to be, its checksum not yet set."""
+    """The description of the exported model, with the placeholder of the checksum."""
     robot = robots.from_dict(checkpoint["robot"])
     return Description(
         schema=model_file.SCHEMA,

@@ -1,4 +1,4 @@
-"""The graph against torch, and against onnx's own evaluator as a third opinion."""
+"""The graph, compared with torch and with the reference evaluator of onnx."""
 
 import numpy as np
 import onnx
@@ -31,18 +31,18 @@ def features(modules, seed=1):
 
 
 @pytest.mark.parametrize(("layers", "hidden"), [(1, 1), (2, 5), (4, 8)])
-def test_weights_come_back_bit_for_bit(layers, hidden):
+def test_weights_are_read_back_bit_for_bit(layers, hidden):
     _, weights = network_and_weights(layers, hidden)
     model = onnx.load_from_string(bilstm_graph.build(weights, sizes(layers, hidden), "{}").SerializeToString())
-    found = bilstm_graph.weights_of(model, sizes(layers, hidden))
-    assert found.keys() == weights.keys()
+    stored = bilstm_graph.weights_of(model, sizes(layers, hidden))
+    assert stored.keys() == weights.keys()
     for name in weights:
-        np.testing.assert_array_equal(found[name], weights[name])
+        np.testing.assert_array_equal(stored[name], weights[name])
 
 
 @pytest.mark.parametrize(("layers", "hidden"), [(1, 3), (2, 5), (4, 8)])
-def test_third_opinion(layers, hidden):
-    """onnx's evaluator, onnxruntime and torch agree, in a whole robot and with neighbours' states fed."""
+def test_torch_onnxruntime_and_onnx_agree(layers, hidden):
+    """For a whole robot, and with neighbours' states as inputs."""
     network, weights = network_and_weights(layers, hidden)
     model = bilstm_graph.build(weights, sizes(layers, hidden), "{}")
     evaluator, unit = ReferenceEvaluator(model), open_unit(model.SerializeToString())
@@ -54,9 +54,9 @@ def test_third_opinion(layers, hidden):
         np.testing.assert_allclose(evaluator.run([ACTUATION], {FEATURES: x[None]})[0][0], expected, atol=2e-6)
         generator = np.random.default_rng(modules)
         states = {n: generator.uniform(-1, 1, (layers, 1, hidden)).astype(np.float32) for n in FROM_NEIGHBOURS}
-        fed = {FEATURES: x[None], **states}
+        inputs = {FEATURES: x[None], **states}
         for name, one, other in zip(
-            (ACTUATION, *TO_NEIGHBOURS), evaluator.run(None, fed), unit.session.run(None, fed), strict=True
+            (ACTUATION, *TO_NEIGHBOURS), evaluator.run(None, inputs), unit.session.run(None, inputs), strict=True
         ):
             np.testing.assert_allclose(one, other, atol=2e-6, err_msg=name)
 
@@ -69,12 +69,12 @@ def test_chain_needs_one_sweep_more_than_layers(layers):
         x = features(modules)
         whole = unit.whole(x)
         np.testing.assert_allclose(unit.chain(x), whole, atol=1e-6)
-        np.testing.assert_allclose(unit.chain(x, sweeps=layers + 4), whole, atol=1e-6)  # and stays there
+        np.testing.assert_allclose(unit.chain(x, sweeps=layers + 4), whole, atol=1e-6)  # and remains
         assert np.abs(unit.chain(x, sweeps=layers) - whole).max() > 1e-5
 
 
-def test_segments_make_the_whole():
-    """A robot cut into two segments, each told the other's states: one sweep of each a layer, as for single modules."""
+def test_two_segments_equal_the_whole_robot():
+    """Two segments that exchange states need as many sweeps as single modules."""
     _, weights = network_and_weights(2, 8)
     unit = open_unit(bilstm_graph.build(weights, sizes(2, 8), "{}").SerializeToString())
     x = features(6)
@@ -89,7 +89,7 @@ def test_segments_make_the_whole():
 
 
 def test_standard_operators_only():
-    """Nothing a small runtime would lack; one LSTM a layer, so that a viewer shows the paper's diagram."""
+    """Also one LSTM node for each layer, so that a viewer shows the diagram of the paper."""
     _, weights = network_and_weights(4, 8)
     model = bilstm_graph.build(weights, sizes(4, 8), "{}")
     assert {node.domain for node in model.graph.node} == {""}

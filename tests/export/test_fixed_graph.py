@@ -1,4 +1,4 @@
-"""The networks bound to their number of modules: graph against torch and a third opinion, planted faults, the loop."""
+"""Networks with a fixed number of modules: graphs compared with torch and onnx, and injected faults."""
 
 import numpy as np
 import onnx
@@ -17,63 +17,63 @@ from modsoft.training import checkpoint as checkpoints
 
 pytestmark = pytest.mark.instructions
 
-BOUND = ("lstm", "module-lstm")
+FIXED = ("lstm", "module-lstm")
 N, F = 4, 16  # cable-4 with three time steps
 
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory, make_checkpoint):
-    """By name of the network: its checkpoint and the export of it."""
-    folder = tmp_path_factory.mktemp("bound")
-    made = {name: make_checkpoint(folder / f"{name}.pt", "cable-4", name=name) for name in BOUND}
-    return {name: (path, export(path)) for name, path in made.items()}
+    """Checkpoint and export, by the name of the network."""
+    folder = tmp_path_factory.mktemp("fixed")
+    paths = {name: make_checkpoint(folder / f"{name}.pt", "cable-4", name=name) for name in FIXED}
+    return {name: (path, export(path)) for name, path in paths.items()}
 
 
 def features(modules=N, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, (modules, F)).astype(np.float32)
 
 
-@pytest.mark.parametrize("name", BOUND)
+@pytest.mark.parametrize("name", FIXED)
 def test_torch_onnxruntime_and_onnx_agree(exported, name):
-    checkpoint, made = exported[name]
+    checkpoint, result = exported[name]
     network = checkpoints.network_of(checkpoints.load(checkpoint))
-    evaluator, controller = ReferenceEvaluator(onnx.load(made.path)), Model.load(made.path)
+    evaluator, model = ReferenceEvaluator(onnx.load(result.path)), Model.load(result.path)
     for seed in range(5):
         x = features(seed=seed)
         with torch.no_grad():
             expected = network(torch.from_numpy(x)[None])[0].numpy()
-        np.testing.assert_allclose(controller.actuate(x), expected, atol=2e-6)
+        np.testing.assert_allclose(model.actuate(x), expected, atol=2e-6)
         np.testing.assert_allclose(evaluator.run([ACTUATION], {FEATURES: x[None]})[0][0], expected, atol=2e-6)
 
 
-@pytest.mark.parametrize("name", BOUND)
-def test_description_says_what_it_is_bound_to(exported, name):
-    said = exported[name][1].description
-    assert (said.network.name, said.network.modules, said.sequence_axis) == (name, N, "time")
-    assert [len(pair.features) for pair in said.golden] == [N]
+@pytest.mark.parametrize("name", FIXED)
+def test_description_has_the_number_of_modules(exported, name):
+    description = exported[name][1].description
+    assert (description.network.name, description.network.modules, description.sequence_axis) == (name, N, "time")
+    assert [len(pair.features) for pair in description.golden] == [N]
     assert list(exported[name][1].report.fused) == [N]
 
 
-@pytest.mark.parametrize("name", BOUND)
+@pytest.mark.parametrize("name", FIXED)
 @pytest.mark.parametrize("modules", [2, 3, 5, 6])
 def test_another_number_of_modules_is_refused(exported, name, modules):
-    controller = Model.load(exported[name][1].path)
+    model = Model.load(exported[name][1].path)
     with pytest.raises(ModelError, match=f"of {modules} modules, expected 4: the network {name} has a fixed number"):
-        controller.actuate(features(modules))
+        model.actuate(features(modules))
 
 
 def test_check_refuses_a_robot_of_another_number_of_modules(exported):
-    controller = Model.load(exported["lstm"][1].path)
-    controller.check(robots.load("cable-4"))
+    model = Model.load(exported["lstm"][1].path)
+    model.check(robots.load("cable-4"))
     with pytest.raises(ModelError, match="trained for modules 4; robot cable-6 has modules 6"):
-        controller.check(robots.load("cable-6"))
+        model.check(robots.load("cable-6"))
 
 
-@pytest.mark.parametrize("name", BOUND)
+@pytest.mark.parametrize("name", FIXED)
 def test_full_size(tmp_path, make_checkpoint, name):
     """Table S1's network, also with weights large enough to saturate it."""
-    made = export(make_checkpoint(tmp_path / "model.pt", "cable-4", 5, layers=4, hidden=128, gain=3.0, name=name))
-    assert max(made.report.fused.values()) <= made.report.bound
+    result = export(make_checkpoint(tmp_path / "model.pt", "cable-4", 5, layers=4, hidden=128, gain=3.0, name=name))
+    assert max(result.report.fused.values()) <= result.report.bound
 
 
 def change(model, name, function):
@@ -109,7 +109,7 @@ def modules_in_the_other_order(model):
     heads = node_of(model, "heads").input
     if len(heads) > 1:
         heads[:] = heads[::-1]
-    else:  # the base's outputs for the tip
+    else:  # outputs of the base for the tip
         change(model, "head_weight", lambda w: w.reshape(len(w), N, -1)[:, ::-1].reshape(w.shape))
 
 
@@ -118,7 +118,7 @@ def bypassed_guard(model):
     model.graph.initializer.append(numpy_helper.from_array(np.zeros((), np.float32), "zero"))
 
 
-def guard_deaf_to_the_label(model):
+def guard_without_the_label(model):
     node = node_of(model, "sum_of_features")
     node.input[0] = "window"
     at, window = list(model.graph.node).index(node), list(model.graph.node).index(node_of(model, "window"))
@@ -137,28 +137,28 @@ FAULTS = [
     time_and_modules_mixed_up,
     modules_in_the_other_order,
     bypassed_guard,
-    guard_deaf_to_the_label,
+    guard_without_the_label,
     backwards_in_time,
 ]
 
 
-@pytest.mark.parametrize("name", BOUND)
+@pytest.mark.parametrize("name", FIXED)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_export_refuses_each_fault_and_leaves_nothing(exported, name, fault, tmp_path, monkeypatch):
+def test_export_refuses_each_fault_and_leaves_no_file(exported, name, fault, tmp_path, monkeypatch):
     build = write.bilstm_graph.build
 
-    def spoilt(*arguments):
+    def build_with_fault(*arguments):
         model = build(*arguments)
         fault(model)
         return model
 
-    monkeypatch.setattr(write.bilstm_graph, "build", spoilt)
+    monkeypatch.setattr(write.bilstm_graph, "build", build_with_fault)
     with pytest.raises(ModelError, match="not written"):
         export(exported[name][0], tmp_path / "model.onnx")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_bound_to_another_number_than_its_robot_has(exported, tmp_path):
+def test_network_for_another_number_than_its_robot_is_refused(exported, tmp_path):
     stored = checkpoints.load(exported["lstm"][0])
     checkpoints.save({**stored, "network": {**stored["network"], "modules": 5}}, tmp_path / "model.pt")
     with pytest.raises(ModelError, match="lstm of 5 modules, expected 4"):

@@ -1,4 +1,4 @@
-"""Checkpoints of other trainings: those of a biLSTM are exported as their message advises, the others are refused."""
+"""Checkpoints of other trainings: those with a biLSTM are exported with --meta, others are refused."""
 
 import codecs
 import re
@@ -30,7 +30,7 @@ def weights():
 
 @pytest.fixture(scope="module")
 def plain(weights, tmp_path_factory):
-    """SHA-256 of the weights, exported from the bare state dict."""
+    """SHA-256 of the weights of the exported bare state dict."""
     folder = tmp_path_factory.mktemp("plain")
     torch.save(weights, folder / "plain.pt")
     (folder / "meta.toml").write_text(META)
@@ -61,10 +61,10 @@ KEYS = {
 
 
 @pytest.mark.parametrize("kind", FITTING)
-def test_the_advice_works_when_it_is_followed(tmp_path, weights, plain, kind):
+def test_checkpoint_of_another_training_is_exported_with_meta(tmp_path, weights, plain, kind):
     path, meta = tmp_path / "other.pt", tmp_path / "meta.toml"
     torch.save(FITTING[kind](weights), path)
-    with pytest.raises(ModelError, match=r"^[^\n]*history[^\n]*say them in a TOML file: --meta FILE[^\n]*$") as error:
+    with pytest.raises(ModelError, match=r"^[^\n]*history[^\n]*set them in a TOML file: --meta FILE[^\n]*$") as error:
         export(path)
     assert error.value.exit_code == 65
     assert (f"a state dict under {KEYS[kind]!r}" if kind in KEYS else "a bare state dict") in str(error.value)
@@ -79,7 +79,7 @@ def test_half_precision_becomes_float32(tmp_path, weights, kind):
     Model.load(export(tmp_path / "half.pt", meta=tmp_path / "meta.toml").path)
 
 
-def test_the_robot_file_is_beside_the_meta_file(tmp_path, monkeypatch, weights):
+def test_robot_file_is_relative_to_the_meta_file(tmp_path, monkeypatch, weights):
     lab, here = tmp_path / "lab", tmp_path / "here"
     lab.mkdir()
     here.mkdir()
@@ -93,7 +93,7 @@ def test_the_robot_file_is_beside_the_meta_file(tmp_path, monkeypatch, weights):
     assert export("w.pt", meta=lab / "meta.toml").description.modules_trained_on == [2]
 
 
-def test_of_several_state_dicts_one_is_chosen(tmp_path, weights, plain):
+def test_one_of_several_state_dicts_is_chosen(tmp_path, weights, plain):
     path, meta = tmp_path / "other.pt", tmp_path / "meta.toml"
     torch.save({"ema": {name: 2 * value for name, value in weights.items()}, "state_dict": weights}, path)
     with pytest.raises(ModelError, match="under 'ema', 'state_dict'; choose one") as error:
@@ -113,9 +113,9 @@ def unidirectional(weights):
 
 
 MISFITS = {
-    "empty": (lambda w: {}, "neither a checkpoint .* nor the state dict of a biLSTM .*found nothing; save such a one"),
-    "other names": (lambda w: {"rnn.w": torch.ones(3), "epoch": 3}, "found 'rnn.w', 'epoch'; save such a one"),
-    "number keys": (lambda w: {0: torch.ones(3)}, "found 0; save such a one"),
+    "empty": (lambda w: {}, "neither a checkpoint .* nor the state dict of a biLSTM .*found nothing; save one"),
+    "other names": (lambda w: {"rnn.w": torch.ones(3), "epoch": 3}, "found 'rnn.w', 'epoch'; save one"),
+    "number keys": (lambda w: {0: torch.ones(3)}, "found 0; save one"),
     "extra": (lambda w: {**w, "norm.weight": torch.ones(3)}, "further norm.weight in the state dict: not the biLSTM"),
     "no bias": (lambda w: {k: v for k, v in w.items() if "bias" not in k}, "no head.bias, lstm.bias_hh_l0, .*not the"),
     "one direction": (unidirectional, "no lstm.bias_hh_l0_reverse, .*not the biLSTM"),
@@ -131,16 +131,16 @@ MISFITS = {
 
 @pytest.mark.parametrize("kind", MISFITS)
 def test_another_network_is_refused_with_and_without_a_meta_file(tmp_path, weights, kind):
-    content, found = MISFITS[kind]
+    content, message = MISFITS[kind]
     torch.save(content(weights), tmp_path / "other.pt")
     (tmp_path / "meta.toml").write_text(META)
     for meta in [None] if "resume" in kind else [None, tmp_path / "meta.toml"]:
-        with pytest.raises(ModelError, match=rf"^[^\n]*other\.pt: [^\n]*{found}[^\n]*$"):
+        with pytest.raises(ModelError, match=rf"^[^\n]*other\.pt: [^\n]*{message}[^\n]*$"):
             export(tmp_path / "other.pt", meta=meta)
     assert not list(tmp_path.glob("*.onnx"))
 
 
-def test_a_whole_network_and_an_old_format_say_what_to_save(tmp_path, weights):
+def test_pickled_network_and_old_format_are_refused_with_advice(tmp_path, weights):
     torch.save(networks.build(SIZES), tmp_path / "whole.pt")
     with pytest.raises(ModelError, match=r"save the weights alone: torch.save\(network.state_dict\(\), FILE\)$"):
         export(tmp_path / "whole.pt")
@@ -150,7 +150,7 @@ def test_a_whole_network_and_an_old_format_say_what_to_save(tmp_path, weights):
 
 
 @pytest.mark.parametrize(("key", "value"), [("robot", 1), ("weights", [1]), ("weights", {"a": 1}), ("features", None)])
-def test_a_checkpoint_with_a_wrong_part_is_one_line(tmp_path, make_checkpoint, key, value):
+def test_checkpoint_with_a_wrong_entry_is_one_line(tmp_path, make_checkpoint, key, value):
     path = make_checkpoint(tmp_path / "m.pt")
     content = torch.load(path, weights_only=True)
     torch.save({**content, key: value}, path)

@@ -1,4 +1,4 @@
-"""Planted faults: each check refuses what it is there for, and the export refuses every one of them."""
+"""Injected faults: each check detects its faults, and the export refuses all of them."""
 
 import numpy as np
 import onnx
@@ -68,7 +68,7 @@ def swapped_outputs(model):
         a.input[1], b.input[1] = b.input[1], a.input[1]
 
 
-def deaf_layer(model):
+def layer_without_neighbours(model):
     lstm = node_of(model, "layer_2_Y")
     lstm.input[5], lstm.input[6] = "", ""
 
@@ -78,11 +78,11 @@ def bypassed_guard(model):
     model.graph.initializer.append(numpy_helper.from_array(np.zeros((), np.float32), "zero"))
 
 
-def guard_deaf_to_neighbours(model):
+def guard_without_neighbours(model):
     node_of(model, "sum_of_inputs").input[1] = "sum_of_features"
 
 
-def guard_deaf_to_the_label(model):
+def guard_without_the_label(model):
     """Sums all features but the last."""
     node = node_of(model, "sum_of_features")
     size = model.graph.input[0].type.tensor_type.shape.dim[2].dim_value
@@ -117,17 +117,17 @@ FAULTS = {
         one_changed_weight,
         swapped_neighbours,
         swapped_outputs,
-        deaf_layer,
+        layer_without_neighbours,
         bypassed_guard,
-        guard_deaf_to_neighbours,
-        guard_deaf_to_the_label,
+        guard_without_neighbours,
+        guard_without_the_label,
         frozen_module_number,
         missing_weight,
         another_opset,
     )
 }
 
-# What each check alone finds. Where a fault stands under several, each was seen to refuse it by itself.
+# Faults that each check detects on its own.
 CHECKS = {
     "graph": {"missing_weight", "another_opset"},
     "weights": {
@@ -142,10 +142,10 @@ CHECKS = {
         "swapped_directions",
         "dropped_recurrent_bias",
         "another_layers_weights",
-        "frozen_module_number",  # refused as the runtime's session looks at the graph's border
+        "frozen_module_number",  # refused when the graph's interface is checked
     },
-    "chain": {"swapped_neighbours", "swapped_outputs", "deaf_layer"},
-    "guard": {"bypassed_guard", "guard_deaf_to_neighbours", "guard_deaf_to_the_label"},
+    "chain": {"swapped_neighbours", "swapped_outputs", "layer_without_neighbours"},
+    "guard": {"bypassed_guard", "guard_without_neighbours", "guard_without_the_label"},
 }
 
 
@@ -156,9 +156,9 @@ def loaded(checkpoint):
 
 
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory, make_checkpoint):
-    """A sound export: its checkpoint, network, sizes, reference and model file."""
-    checkpoint = make_checkpoint(tmp_path_factory.mktemp("sound") / "model.pt")
+def exported(tmp_path_factory, make_checkpoint):
+    """A valid export: its checkpoint, network, sizes, reference and model file."""
+    checkpoint = make_checkpoint(tmp_path_factory.mktemp("exported") / "model.pt")
     network, sizes = loaded(checkpoint)
     return checkpoint, network, sizes, parity.reference(network, sizes), export(checkpoint).path
 
@@ -173,68 +173,68 @@ def run(check, path, network, sizes, expected):
         return parity.check_fused(open_unit(path.read_bytes()), expected)
     if check == "chain":
         return parity.check_chain(open_unit(path.read_bytes()), expected)
-    return parity.check_guard(open_unit(path.read_bytes()), expected)
+    return parity.check_nan(open_unit(path.read_bytes()), expected)
 
 
 @pytest.mark.parametrize("check", CHECKS)
-def test_sound_file_passes_each_check(check, sound):
-    _, network, sizes, expected, path = sound
+def test_valid_file_passes_each_check(check, exported):
+    _, network, sizes, expected, path = exported
     run(check, path, network, sizes, expected)
 
 
 @pytest.mark.parametrize(("check", "fault"), [(check, fault) for check in CHECKS for fault in sorted(CHECKS[check])])
-def test_each_check_finds_its_faults(check, fault, sound, tmp_path):
-    _, network, sizes, expected, path = sound
+def test_each_check_detects_its_faults(check, fault, exported, tmp_path):
+    _, network, sizes, expected, path = exported
     model = onnx.load(path)
     FAULTS[fault](model)
-    spoilt = tmp_path / "spoilt.onnx"
-    spoilt.write_bytes(model.SerializeToString())
+    corrupted = tmp_path / "corrupted.onnx"
+    corrupted.write_bytes(model.SerializeToString())
     with pytest.raises(ModelError):
-        run(check, spoilt, network, sizes, expected)
+        run(check, corrupted, network, sizes, expected)
 
 
-def test_every_fault_is_some_checks():
+def test_every_fault_is_detected_by_a_check():
     assert set(FAULTS) == set().union(*CHECKS.values())
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_export_refuses_and_leaves_nothing(fault, sound, tmp_path, monkeypatch):
-    checkpoint, *_ = sound
+def test_export_refuses_and_leaves_nothing(fault, exported, tmp_path, monkeypatch):
+    checkpoint, *_ = exported
     build = bilstm_graph.build
 
-    def spoilt(*arguments):
+    def build_with_fault(*arguments):
         model = build(*arguments)
         FAULTS[fault](model)
         return model
 
-    monkeypatch.setattr(write.bilstm_graph, "build", spoilt)
+    monkeypatch.setattr(write.bilstm_graph, "build", build_with_fault)
     with pytest.raises(ModelError, match="not written"):
         export(checkpoint, tmp_path / "model.onnx")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_fixed_bound_where_torch_is_exact_and_none_beyond_a_thousandth():
+def test_bound_is_at_least_1e_5_and_at_most_1e_3():
     for torch_error, bound in ((0.0, 1e-5), (1e-7, 1e-5), (2e-5, 2e-4), (1.0, 1e-3)):
         assert parity.Reference({}, {}, torch_error, 2.0).bound == pytest.approx(bound)
     assert parity.Reference({}, {}, 2e-5, 2.0).tolerance == pytest.approx(4e-4)
 
 
-def test_what_goes_into_the_description_is_a_plain_number(make_checkpoint, tmp_path):
-    """With small weights the bound is a constant; where float32 rounds more, it is what numpy measured."""
+def test_tolerance_is_a_python_float(make_checkpoint, tmp_path):
+    """The bound is a constant for small weights, and a value of numpy where rounding is larger."""
     network, sizes = loaded(make_checkpoint(tmp_path / "model.pt", gain=30.0))
     expected = parity.reference(network, sizes)
     assert type(expected.torch_error) is type(expected.tolerance) is float
     assert expected.torch_error > 0.0
 
 
-def test_a_network_that_ignores_its_neighbours_is_refused(sound, tmp_path, make_checkpoint):
-    """The negative control: without recurrent weights a chain is right at once, and so proves nothing."""
+def test_network_that_ignores_its_neighbours_is_refused(exported, tmp_path, make_checkpoint):
+    """Negative control: without recurrent weights a chain is exact without the last sweep."""
     network, sizes = loaded(make_checkpoint(tmp_path / "model.pt"))
     with torch.no_grad():
         for name, weight in network.named_parameters():
             if "weight_hh" in name:
                 weight.zero_()
-            elif "bias" in name and "lstm" in name:  # forget gate shut: the cell state carries nothing either
+            elif "bias" in name and "lstm" in name:  # forget gate closed: no cell state is passed on
                 weight[weight.shape[0] // 4 : weight.shape[0] // 2] = -100.0
     expected = parity.reference(network, sizes)
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
@@ -244,22 +244,22 @@ def test_a_network_that_ignores_its_neighbours_is_refused(sound, tmp_path, make_
         parity.check_chain(unit, expected)
 
 
-def test_a_network_deaf_to_its_features_is_refused(make_checkpoint, tmp_path):
-    with pytest.raises(ModelError, match="depend on them"):
+def test_network_that_ignores_its_features_is_refused(make_checkpoint, tmp_path):
+    with pytest.raises(ModelError, match="depend on the features"):
         export(make_checkpoint(tmp_path / "model.pt", gain=0.0))
     assert [entry.name for entry in tmp_path.iterdir()] == ["model.pt"]
 
 
-def test_over_many_modules_a_network_is_compared_only_where_float32_tells_something(make_checkpoint, tmp_path):
-    """Large recurrent weights make the row of modules chaotic: rounding then grows from module to module."""
+def test_chaotic_network_is_not_compared_over_many_modules(make_checkpoint, tmp_path):
+    """With large recurrent weights, rounding errors grow from module to module."""
     network, sizes = loaded(make_checkpoint(tmp_path / "model.pt", layers=4, hidden=64))
-    tame = parity.reference(network, sizes)
-    assert list(tame.features) == list(parity.MODULES)
+    regular = parity.reference(network, sizes)
+    assert list(regular.features) == list(parity.MODULES)
     with torch.no_grad():
         for name, weight in network.named_parameters():
             if "weight_hh" in name:
                 weight.mul_(40.0)
-    wild = parity.reference(network, sizes)
-    assert list(wild.features) == list(wild.actuation)
-    assert {2, 3, 4} <= set(wild.features)
-    assert 64 not in wild.features
+    chaotic = parity.reference(network, sizes)
+    assert list(chaotic.features) == list(chaotic.actuation)
+    assert {2, 3, 4} <= set(chaotic.features)
+    assert 64 not in chaotic.features

@@ -1,4 +1,4 @@
-"""From a checkpoint to a model file, what is refused on the way, and the command."""
+"""Export of checkpoints, refused inputs, and the command."""
 
 import subprocess
 import sys
@@ -34,9 +34,9 @@ def model(tmp_path, make_checkpoint):
 def modsoft_export(monkeypatch, *arguments):
     """The exit code of the command."""
     monkeypatch.setattr(sys, "argv", ["modsoft-export", *map(str, arguments)])
-    with pytest.raises(SystemExit) as leaving:
+    with pytest.raises(SystemExit) as caught:
         cli.main()
-    return leaving.value.code
+    return caught.value.code
 
 
 @pytest.mark.parametrize(("robot", "history", "gain"), [("pneumatic-3", 10, 1.0), ("cable-4", 5, 3.0)])
@@ -52,25 +52,30 @@ def test_full_size(tmp_path, make_checkpoint, robot, history, gain):
     assert max(report.chain.values()) <= report.bound
     assert max(report.one_sweep_fewer.values()) > 10 * max(report.chain.values())
     network = checkpoints.network_of(checkpoints.load(checkpoint))
-    controller = Model.load(exported.path)
-    assert controller.history == history
-    x = np.random.default_rng(5).uniform(-1, 1, (9, controller.unit.feature_size))  # no N that was checked
+    loaded = Model.load(exported.path)
+    assert loaded.history == history
+    x = np.random.default_rng(5).uniform(-1, 1, (9, loaded.unit.feature_size))  # an N that the export does not compare
     with torch.no_grad():
         expected = network(torch.from_numpy(x).float()[None])[0].numpy()
-    np.testing.assert_allclose(controller.actuate(x), expected, atol=1e-5)
+    np.testing.assert_allclose(loaded.actuate(x), expected, atol=1e-5)
 
 
-def test_description_says_all(model):
-    said = export(model).description
+def test_description_is_complete(model):
+    description = export(model).description
     stored = checkpoints.load(model)
-    assert (said.kind, said.state_size, said.action_size, said.period_s) == ("pneumatic", 2, 1, 0.4)
-    assert (said.modules_trained_on, said.network.history) == ([3], 3)
-    assert said.features == stored["features"]
-    assert said.robot["robot"]["name"] == "pneumatic-3"
-    assert said.provenance == stored["provenance"]
-    assert [len(pair.features) for pair in said.golden] == [2, 4]
-    assert len(said.file_sha256) == 64
-    assert said.file_sha256 != "0" * 64
+    assert (description.kind, description.state_size, description.action_size, description.period_s) == (
+        "pneumatic",
+        2,
+        1,
+        0.4,
+    )
+    assert (description.modules_trained_on, description.network.history) == ([3], 3)
+    assert description.features == stored["features"]
+    assert description.robot["robot"]["name"] == "pneumatic-3"
+    assert description.provenance == stored["provenance"]
+    assert [len(pair.features) for pair in description.golden] == [2, 4]
+    assert len(description.file_sha256) == 64
+    assert description.file_sha256 != "0" * 64
 
 
 def test_weights_hash_is_the_weights(tmp_path, make_checkpoint):
@@ -98,11 +103,11 @@ def of(weights, change):
         (lambda c: {"weights": of(c["weights"], lambda t: t.double())}, "float64, expected torch.float32"),
         (lambda c: {"weights": of(c["weights"], lambda t: t * float("nan"))}, "not finite"),
         (lambda c: {"provenance": {"file_sha256": "0" * 64}}, "file_sha256"),
-        (lambda c: {"provenance": {"mean": torch.zeros(2)}}, "no plain value"),
+        (lambda c: {"provenance": {"mean": torch.zeros(2)}}, "a value that JSON does not have"),
         (lambda c: {"schema": 99}, "schema 99"),
     ],
 )
-def test_refused_checkpoints(model, changes, message):
+def test_wrong_checkpoints_are_refused(model, changes, message):
     stored = checkpoints.load(model)
     checkpoints.save({**stored, **changes(stored)}, model)
     with pytest.raises(ModelError, match=message):
@@ -110,21 +115,21 @@ def test_refused_checkpoints(model, changes, message):
     assert not model.with_suffix(".onnx").exists()
 
 
-def test_a_checkpoint_that_would_run_code_or_holds_numpy_is_refused(tmp_path):
+def test_checkpoint_with_numpy_objects_is_refused(tmp_path):
     torch.save({"weights": np.float64(1.0)}, tmp_path / "model.pt")
     with pytest.raises(ModelError, match="not a checkpoint"):
         export(tmp_path / "model.pt")
 
 
-def test_the_old_file_stays_when_the_new_one_is_refused(model, monkeypatch):
+def test_old_file_remains_when_the_new_one_is_refused(model, monkeypatch):
     path = export(model).path
     before = path.read_bytes()
 
     def refuse(*_):
-        raise ModelError("a check says no")
+        raise ModelError("a check failed")
 
     monkeypatch.setattr(write.parity, "verify", refuse)
-    with pytest.raises(ModelError, match=r"model.onnx not written: a check says no"):
+    with pytest.raises(ModelError, match=r"model.onnx not written: a check failed"):
         export(model)
     assert path.read_bytes() == before
     assert sorted(entry.name for entry in path.parent.iterdir()) == ["model.onnx", "model.pt"]
@@ -140,7 +145,7 @@ def test_disk_full_leaves_nothing(model, monkeypatch):
     assert [entry.name for entry in model.parent.iterdir()] == ["model.pt"]
 
 
-def test_a_model_that_is_onnx_already_is_sent_to_inspect(model):
+def test_onnx_file_as_input_is_refused(model):
     with pytest.raises(UsageError, match="did you mean modsoft-export --inspect"):
         export(model.with_name("other.onnx"), model.with_name("new.onnx"))
 
@@ -154,14 +159,14 @@ def test_out_must_be_a_file_in_a_folder(model, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"mine", b""])
-def test_a_file_that_export_did_not_make_is_replaced_only_where_it_is_named(model, content):
+def test_other_file_is_replaced_only_if_named(model, content):
     out = model.with_suffix(".onnx")
     out.write_bytes(content)
-    with pytest.raises(UsageError, match=r"model\.onnx: exists, and is no model of modsoft-export; give --out"):
+    with pytest.raises(UsageError, match=r"model\.onnx: exists, not a model of modsoft-export; give --out"):
         export(model)
     assert out.read_bytes() == content
     assert export(model, out).path == out
-    assert export(model).path == out, "its own is replaced"
+    assert export(model).path == out, "a model of modsoft-export is replaced"
 
 
 @pytest.fixture
@@ -194,7 +199,7 @@ def test_bare_state_dict_needs_a_meta_file(bare):
         ("history = 3", "history = 3\ncolour = 1", "colour"),
     ],
 )
-def test_wrong_meta_files(bare, old, new, message):
+def test_wrong_meta_files_are_refused(bare, old, new, message):
     weights, meta = bare
     meta.write_text(META.replace(old, new))
     with pytest.raises(ModelError, match=message):
