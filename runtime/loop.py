@@ -148,7 +148,10 @@ class Loop:
         frame, silence_s = self.frames.latest(), self.robot.limits.invalid_frames * self.robot.loop.period_s
         # The check runs once a slice, so the run ends half a slice early or late at most.
         if frame is not None and self.ticker.now() - frame.monotonic_s > silence_s - SLICE_S / 2:
-            raise LostInRun(f"tracker: no new frame for {silence_s:.1f} s; look at the tracker, then start again")
+            cause = f" ({self.frames.problem})" if self.frames.problem else ""
+            raise LostInRun(
+                f"tracker: no new frame for {silence_s:.1f} s{cause}; look at the tracker, then start again"
+            )
 
     def _acknowledged(self, step: int, sequence: int | None) -> Acknowledgement:
         """Whether the board has acknowledged the set-points of `step` (None: it sent none), and after what time."""

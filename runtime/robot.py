@@ -91,12 +91,14 @@ class Limits(Section, frozen=True):
 
 class Tracker(Section, frozen=True):
     """`[tracker]`: source and its port (replay: a run's folder); `tools` are the tool definition files, base first,
-    then module 1 to N. Paths are relative to the folder of the robot file."""
+    then module 1 to N. Paths are relative to the folder of the robot file. `frame_hz`: frame rate of the device; it is
+    learned from the frame numbers where it is not set."""
 
     source: Literal["ndi", "replay"] = "ndi"
     type: Literal["polaris", "vega", "aurora"] = "polaris"
     port: str = ""
     tools: tuple[str, ...] = ()
+    frame_hz: Annotated[float, Meta(ge=1.0, le=1000.0)] | None = None
 
 
 class Serial(Section, frozen=True):

@@ -18,6 +18,7 @@ from modsoft.runtime.tracking.frame import TrackerFrame
 MISSED_IN_A_ROW = 2  # skipped ticks that are waited out; the board's own timer vents after 1 s
 RAW_LIMIT = 3.0  # the actuation runs from -1 to 1: a network that answers this far out extrapolates
 BASELINE_S = 60.0  # over which the device's count is compared with the host's clock: 100 ppm make 6 ms of it
+BASELINE_STEP_S = 0.25  # between two frames of the baseline: a fast loop keeps no more of them than a slow one
 NOISE_DEG = 5.0  # marker noise on top of the fastest motion
 CONFIRMING_FRAMES = 3  # valid frames in a row that agree with a jump before it is accepted
 STRETCH = 1.3  # a module's end is never further from the end before it than at rest, but for this
@@ -67,7 +68,7 @@ class FrameValidator:
         self._used_configuration: Array | None = None
         self._jumped: list[tuple[TrackerFrame, Array]] = []  # a jump and the frames that confirm it
         self._rest_mm: list[float] | None = None
-        self._offsets: deque[tuple[float, float]] = deque()  # (host's time, host's time - device's time)
+        self._prompt: deque[tuple[float, int]] = deque()  # (host's time, device's frame number)
 
     def judge(self, frame: TrackerFrame | None, now_s: float) -> FrameCheck:
         """Judges the newest frame at `now_s`, seconds of the monotonic clock."""
@@ -103,16 +104,18 @@ class FrameValidator:
         return GOOD, "", None
 
     def _delay_s(self, frame: TrackerFrame) -> float:
-        """How much later this frame came than the promptest one of the last minute, by the device's count."""
+        """How much later this frame came than the promptest one of the last minute, by the device's count; 0 while the
+        device's frame rate is unknown."""
         if frame.device_hz is None:
             return 0.0
-        offset_s = frame.monotonic_s - frame.device_frame / frame.device_hz
-        promptest_s = min((offset for _, offset in self._offsets), default=offset_s)
-        if offset_s - promptest_s <= self.robot.limits.tracker_age_s:  # a delayed device sets no new baseline
-            self._offsets.append((frame.monotonic_s, offset_s))
-            while self._offsets[0][0] < frame.monotonic_s - BASELINE_S:
-                self._offsets.popleft()
-        return max(0.0, offset_s - promptest_s)
+        at_s, number, period_s = frame.monotonic_s, frame.device_frame, 1.0 / frame.device_hz
+        delay_s = max((at_s - to_s - (number - count) * period_s for to_s, count in self._prompt), default=0.0)
+        if delay_s <= self.robot.limits.tracker_age_s:  # a delayed device sets no new baseline
+            if not self._prompt or at_s - self._prompt[-1][0] >= BASELINE_STEP_S:
+                self._prompt.append((at_s, number))
+            while self._prompt[0][0] < at_s - BASELINE_S:
+                self._prompt.popleft()
+        return max(0.0, delay_s)
 
     def content(self, frame: TrackerFrame) -> tuple[str, str, Array | None]:
         """What is wrong with the poses, in a word and in detail, else the configuration (N, 3). Remembers nothing."""

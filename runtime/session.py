@@ -275,7 +275,8 @@ def _rest(
         if slot.error is not None:
             raise missing(f"tracker: {slot.error}")
         if now() > until_s:
-            detail = f" ({judged.detail})" if judged.detail else ""
+            detail = judged.detail or slot.problem
+            detail = f" ({detail})" if detail else ""
             raise missing(
                 f"tracker: no good frame within {FIRST_FRAME_WAIT_S:.0f} s, the last one {judged.word}{detail}; "
                 "are all tools in view?"

@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 from modsoft.runtime.arrays import Array
 
 
+class FrameError(Exception):
+    """A reply of the tracker, or its absence, that gives no frame. The next read may succeed."""
+
+
 @dataclass(frozen=True)
 class TrackerFrame:
     """What the tracker measured at one instant: the tool of the base and those at the module ends, in the tracker's
@@ -30,11 +34,13 @@ class TrackerFrame:
     quality: Array  # (N + 1,), the device's own measure (NDI: RMS error, mm), NaN where there is none
     device_hz: float | None = None
     port_status: tuple[int, ...] | None = None  # N + 1
+    answered_s: float | None = None  # when the device's reply was complete, monotonic
 
 
 class Source(Protocol):
-    """Where frames come from. `read` returns None when there is no new frame, and may block. One thread reads and
-    closes a source, since the clients of trackers are not thread-safe."""
+    """Where frames come from. `read` returns None when there is no new frame, may block, and raises `FrameError` for
+    what the next read may overcome. One thread reads and closes a source: the clients of trackers are not
+    thread-safe."""
 
     def read(self) -> TrackerFrame | None: ...
     def close(self) -> None: ...
@@ -49,7 +55,8 @@ class LatestFrame:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._frame: TrackerFrame | None = None
-        self.counts: Counter[str] = Counter()  # received, repeated, backwards
+        self.counts: Counter[str] = Counter()  # received, repeated, backwards, unreadable
+        self.problem = ""  # the last error since the last frame
         self.error: BaseException | None = None  # what ended the reading
 
     def put(self, frame: TrackerFrame) -> None:
@@ -57,9 +64,15 @@ class LatestFrame:
             held = self._frame
             if held is None or frame.device_frame > held.device_frame:
                 self._frame = frame
+                self.problem = ""
                 self.counts["received"] += 1
             else:
                 self.counts["repeated" if frame.device_frame == held.device_frame else "backwards"] += 1
+
+    def put_error(self, error: FrameError) -> None:
+        """A read that gave no frame."""
+        self.problem = str(error)
+        self.counts["unreadable"] += 1
 
     def latest(self) -> TrackerFrame | None:
         with self._lock:

@@ -1,33 +1,40 @@
-"""Frames from an NDI tracker (Polaris, Vega, Aurora) through scikit-surgerynditracker, the extra `ndi`."""
+"""Frames from an NDI tracker (Polaris, Vega, Aurora) through scikit-surgerynditracker, the extra `ndi`.
+
+Its C library can crash or block, so `modsoft.runtime.tracking.client_process` runs this module in a process of its own.
+"""
 
 from __future__ import annotations
 
 import math
+import os
 import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.ports import describe_ports
 from modsoft.runtime.errors import DeviceAbsent, UsageError
-from modsoft.runtime.tracking.frame import TrackerFrame
+from modsoft.runtime.locks import system_module
+from modsoft.runtime.tracking import tx_reply
+from modsoft.runtime.tracking.frame import FrameError, TrackerFrame
+from modsoft.runtime.tracking.frame_rate import FrameRate
 
-# How fast each device counts its frames, whatever share of them is asked for (NDI's API guides).
-FRAME_HZ = {"polaris": 60.0, "vega": 60.0, "aurora": 40.0}
+POLL_S = 1 / 60  # between two requests: replies hold the newest frame, also those of a faster device
 NETWORK_PORT = 8765
-ERRORS_IN_A_ROW = 3  # a byte that was hurt on the line is waited out, a device that was unplugged is not
+BAD_CRC, TIMEOUT = 0x0100, 0x0103  # errors of ndicapi that the next request overcomes
+ERRORS_IN_A_ROW = 3  # other errors, after which the device is connected again
+REPLY_TENTHS = 3  # of a second: the longest pause within a reply, for one whose carriage return was lost
+FIVE_DOF_FRAMES = 10  # in which a tool never rolls
+START_FRAMES = 60  # that are read at the start, until every tool was seen
 
 
 class NDI:
-    """A source of frames. Connects and starts tracking when it is made; `read` blocks while the device is mute.
+    """A source of frames, connected and tracking.
 
-    kind: of the device, as in the robot file; port: serial port, or HOST[:PORT] for `vega`; tools: definition files,
-    base first (none for `aurora`, whose tools are wired); count: tools that are expected.
-    Raises `DeviceAbsent`, and `UsageError` for missing tool files.
+    kind: type of the device, as in the robot file; port: serial port, or HOST[:PORT] for `vega`; tools: definition
+    files, base first (none for `aurora`, whose tools are wired); count: expected number of tools; frame_hz: frame rate
+    of the device, learned if None. Raises `DeviceAbsent`, and `UsageError` for missing tool files.
     """
 
     def __init__(
@@ -36,71 +43,94 @@ class NDI:
         port: str,
         tools: list[Path],
         count: int,
+        frame_hz: float | None = None,
         now: Callable[[], float] = time.monotonic,
         wait: Callable[[float], object] = time.sleep,
     ):
-        self._kind, self._port = kind, port
+        self._port = port
         self._now, self._wait = now, wait
-        self._period_s = 1.0 / FRAME_HZ[kind]
         self._due_s = now()
         self._newest = -1
         self._errors = 0
-        self._tracker = _connected(kind, port, _checked(kind, tools, count))
-        found = len(self._tracker.get_tool_descriptions()[0])
-        if found != count:
+        self._rate = FrameRate(frame_hz)
+        self._client = _connected(kind, port, checked_tools(kind, tools, count))
+        try:
+            self._handles = [int(handle) for handle in self._client.get_tool_descriptions()[0]]
+            if len(self._handles) != count:
+                raise DeviceAbsent(
+                    f"tracker at {port}: {len(self._handles)} tools, the robot needs {count}: base, then modules"
+                )
+            # A magnetic sensor of five degrees of freedom may be any tool of an Aurora.
+            self._still = dict.fromkeys(self._handles, 0) if kind == "aurora" else {}
+            self._check_start()
+        except BaseException:
             self.close()
-            raise DeviceAbsent(f"tracker at {port}: {found} tools, the robot needs {count}: base, then modules")
+            raise
 
     def read(self) -> TrackerFrame | None:
-        """The next frame, at the pace at which the device makes them; None while it has no new one. Raises
-        `DeviceAbsent` at the third error in a row."""
+        """The next frame, None if there is no new one. `FrameError` for a damaged reply; `DeviceAbsent` after three
+        other errors in a row."""
         left_s = self._due_s - self._now()
         if left_s > 0:
             self._wait(left_s)
-        asked_s = self._now()
-        self._due_s = max(self._due_s + self._period_s, asked_s)
+        requested_s = self._now()
+        self._due_s = max(self._due_s + POLL_S, requested_s)
         try:
-            _, _, numbers, poses, quality = self._tracker.get_frame()
+            reply = self._client.tx()
+        except UnicodeDecodeError as error:
+            raise FrameError("reply that is not text") from error
         except OSError as error:
+            if self._client.error_code() in (BAD_CRC, TIMEOUT):
+                raise FrameError(_one_line(error)) from error
             self._errors += 1
-            if self._errors == ERRORS_IN_A_ROW:
-                raise DeviceAbsent(f"tracker at {self._port}: {_one_line(error)}") from error
-            return None
+            kind = FrameError if self._errors < ERRORS_IN_A_ROW else DeviceAbsent
+            raise kind(f"tracker at {self._port}: {_one_line(error)}") from error
+        answered_s = self._now()
         self._errors = 0
-        # A tool that was left out of the answer has number 0, so the newest number is the frame's.
-        number = int(max(number for number in numbers if not math.isnan(number)))
-        if number == self._newest:
+        frame = tx_reply.parse(reply, self._handles, requested_s, answered_s, self._rate.hz)
+        if frame.device_frame == self._newest:
             return None
-        self._newest = number
-        stack = np.asarray(poses, dtype=np.float64)
-        valid = np.asarray(np.isfinite(stack).all(axis=(1, 2)))
-        return TrackerFrame(number, asked_s, stack, valid, np.asarray(quality, dtype=np.float64), FRAME_HZ[self._kind])
+        self._rate.add(frame.device_frame, requested_s)
+        self._newest = frame.device_frame
+        self._check_roll(frame.poses)
+        return frame
 
     def close(self) -> None:
         try:
-            self._tracker.close()
-        except OSError:
-            pass  # a device that is gone cannot be told to stop
+            self._client.close()
+        except (OSError, ValueError):
+            pass  # a lost device cannot be stopped
+
+    def _check_start(self) -> None:
+        """Reads until the tools are known to have six degrees of freedom, or for `START_FRAMES` requests."""
+        for _ in range(START_FRAMES):
+            if not self._still:
+                return
+            try:
+                self.read()
+            except FrameError:
+                continue
+
+    def _check_roll(self, poses: Any) -> None:
+        """`DeviceAbsent` for a tool with five degrees of freedom. The device cannot measure its roll, and reports
+        rotations without a component about the tool's z axis: exactly 0, which a real rotation never is for long."""
+        for tool, handle in enumerate(self._handles):
+            if handle not in self._still or not math.isfinite(poses[tool, 0, 0]):
+                continue
+            if poses[tool, 1, 0] != poses[tool, 0, 1]:  # their difference is 4 w z
+                del self._still[handle]
+                continue
+            self._still[handle] += 1
+            if self._still[handle] >= FIVE_DOF_FRAMES:
+                name = "base" if tool == 0 else f"module {tool}"
+                raise DeviceAbsent(
+                    f"tracker at {self._port}: the tool of the {name} has five degrees of freedom, expected six: its "
+                    "roll is unknown; use 6-DOF tools"
+                )
 
 
-def matrices(quaternions: Array, translations: Array) -> Array:
-    """Poses (n, 4, 4) from unit quaternions (n, 4), w first, and translations (n, 3), mm; NaN stays NaN."""
-    rows = zip(np.asarray(quaternions).tolist(), np.asarray(translations).tolist(), strict=True)
-    return np.array([_matrix(*quaternion, *translation) for quaternion, translation in rows])
-
-
-def _matrix(w: float, x: float, y: float, z: float, x_mm: float, y_mm: float, z_mm: float) -> list[list[float]]:
-    """One pose (4, 4); a few numbers of Python are faster than arrays of a few numbers."""
-    return [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), x_mm],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), y_mm],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), z_mm],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-
-
-def _checked(kind: str, tools: list[Path], count: int) -> list[Path]:
-    """The tool files, as many as there must be, all of them there."""
+def checked_tools(kind: str, tools: list[Path], count: int) -> list[Path]:
+    """The tool files, which exist in the expected number."""
     if kind == "aurora":
         return []
     if len(tools) != count:
@@ -120,16 +150,62 @@ def _checked(kind: str, tools: list[Path], count: int) -> list[Path]:
 def _connected(kind: str, port: str, tools: list[Path]) -> Any:
     """A client that tracks."""
     try:
-        import ndicapy
-        from sksurgerynditracker.nditracker import NDITracker
+        client = _client_type()
     except ImportError as error:
         raise DeviceAbsent(
             f"tracker source ndi needs the extra of that name ({error}); run: pip install 'modsoft[ndi]'"
         ) from error
+    settings: dict[str, Any] = {"tracker type": kind, "romfiles": [str(path) for path in tools]}
+    if kind == "vega":
+        host, _, network_port = port.partition(":")
+        settings |= {"ip address": host, "port": int(network_port or NETWORK_PORT)}
+    else:
+        settings["serial port"] = port
+        if port.startswith("/") and not Path(port).exists():
+            raise DeviceAbsent(f"no tracker at {port}: no such port; {describe_ports()}")
+    try:
+        tracker = client(settings)
+        tracker.start_tracking()
+    except (OSError, ValueError) as error:
+        raise DeviceAbsent(
+            f"no {kind} tracker answers at {port} ({_one_line(error)}); is it switched on, and is this its port?"
+        ) from error
+    return tracker
+
+
+def _client_type() -> type[Any]:
+    """The client of scikit-surgerynditracker, with a strict and quick reading of frames."""
+    import ndicapy
+    from sksurgerynditracker.nditracker import NDITracker
 
     class TextNDI(NDITracker):
-        """Asks for TX, which every device answers. The binary BX comes through ndicapi as text, and fails as soon as
-        a byte of it is no UTF-8: with three tools, for instance (ndicapi's issue 46)."""
+        """Requests TX, which every device answers. The binary BX comes through ndicapi as text, and fails as soon as
+        a byte of it is not UTF-8: with three tools, for instance (ndicapi's issue 46)."""
+
+        _port: SerialSettings | None = None
+
+        def tx(self) -> str:
+            """The reply to TX without its checksum, transforms out of the volume included. Raises OSError."""
+            return str(ndicapy.ndiCommand(self._device, "TX:0801"))
+
+        def error_code(self) -> int:
+            return int(ndicapy.ndiGetError(self._device))
+
+        def start_tracking(self) -> None:
+            super().start_tracking()
+            if self._port is not None:
+                self._port.limit_pause(REPLY_TENTHS)
+
+        def close(self) -> None:
+            try:
+                super().close()
+            finally:
+                if self._port is not None:
+                    self._port.close()
+
+        def _connect_serial(self, name: str) -> None:
+            super()._connect_serial(name)
+            self._port = SerialSettings(name)
 
         def _connect_network(self, configuration: dict[str, Any]) -> None:
             """The client calls ping first, to save the time-out of a wrong address; not every machine has it."""
@@ -142,35 +218,37 @@ def _connected(kind: str, port: str, tools: list[Path]) -> Any:
             ndicapy.ndiCommand(self._device, "INIT:")
             self._check_for_errors("Sending INIT command")
 
-        def _set_use_bx_transforms(self) -> None:
-            self._get_frame, self._get_transform = ndicapy.ndiGetTXFrame, ndicapy.ndiGetTXTransform
-            self._capture_string = "TX:0801"
+    return TextNDI
 
-        # The client takes means over the frames of a buffer. Ours has one, and that took most of a frame's time.
-        def add_frame_to_buffer(
-            self, handles: Any, times: Any, numbers: Any, rotations: Any, translations: Any, quality: Any, **how: Any
-        ) -> None:
-            self._newest = times, numbers, matrices(np.array(rotations), np.array(translations)), quality
 
-        def get_smooth_frame(self, port_handles: Any) -> Any:
-            return port_handles, *self._newest
+class SerialSettings:
+    """Settings of the open serial port that ndicapi has no function for; without effect where there is no termios.
 
-    settings: dict[str, Any] = {"tracker type": kind, "romfiles": [str(path) for path in tools]}
-    if kind == "vega":
-        host, _, network_port = port.partition(":")
-        settings |= {"ip address": host, "port": int(network_port or NETWORK_PORT)}
-    else:
-        settings["serial port"] = port
-        if port.startswith("/") and not Path(port).exists():
-            raise DeviceAbsent(f"no tracker at {port}: no such port; {describe_ports()}")
-    try:
-        tracker = TextNDI(settings)
-        tracker.start_tracking()
-    except (OSError, ValueError) as error:
-        raise DeviceAbsent(
-            f"no {kind} tracker answers at {port} ({_one_line(error)}); is it switched on, and is this its port?"
-        ) from error
-    return tracker
+    Text has seven bits. ndicapi crashes on a reply with the eighth bit set, so the port clears it; a damaged bit is
+    then repaired, and the checksum still covers the others.
+    """
+
+    def __init__(self, port: str):
+        self._termios: Any = system_module("termios")
+        self._port = -1
+        if self._termios is not None:
+            self._port = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            self._set(lambda modes: modes.__setitem__(0, modes[0] | self._termios.ISTRIP))
+
+    def limit_pause(self, tenths: int) -> None:
+        """Ends a read after a pause of `tenths` of a second: ndicapi waits for 5 s."""
+        if self._termios is not None:
+            self._set(lambda modes: modes[6].__setitem__(self._termios.VTIME, tenths))
+
+    def close(self) -> None:
+        if self._port >= 0:
+            os.close(self._port)
+            self._port = -1
+
+    def _set(self, change: Callable[[list[Any]], None]) -> None:
+        modes = self._termios.tcgetattr(self._port)
+        change(modes)
+        self._termios.tcsetattr(self._port, self._termios.TCSANOW, modes)
 
 
 def _one_line(error: Exception) -> str:

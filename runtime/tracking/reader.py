@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from modsoft.runtime.tracking.frame import LatestFrame, Source
+from modsoft.runtime.tracking.frame import FrameError, LatestFrame, Source
 
 CLOSE_WAIT_S = 0.5  # a client that waits for a mute device is not waited for any longer
 
@@ -23,7 +23,11 @@ class Reader:
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                frame = self._source.read()
+                try:
+                    frame = self._source.read()
+                except FrameError as error:
+                    self._latest.put_error(error)
+                    continue
                 if frame is not None:
                     self._latest.put(frame)
         except Exception as error:  # noqa: BLE001 - any error of a driver ends the run, with venting

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from modsoft.runtime.errors import UsageError
 from modsoft.runtime.robot import Robot
+from modsoft.runtime.tracking.client_process import ClientProcess
 from modsoft.runtime.tracking.frame import Source
+from modsoft.runtime.tracking.ndi import NDI, checked_tools
+from modsoft.runtime.tracking.replay import Replay
 
 
 def port_of(robot: Robot, folder: Path) -> str:
@@ -24,12 +28,10 @@ def open_source(robot: Robot, port: str, tools: list[Path]) -> Source:
         raise UsageError(f"no {what} given; use --tracker-port, or set port under [tracker] in the robot file")
     match settings.source:
         case "ndi":
-            from modsoft.runtime.tracking.ndi import NDI  # the extra's client takes a third of a second to import
-
-            return NDI(settings.type, port, tools, robot.modules + 1)
+            count = robot.modules + 1
+            open_client = partial(NDI, settings.type, port, checked_tools(settings.type, tools, count), count)
+            return ClientProcess(partial(open_client, settings.frame_hz), f"tracker at {port}")
         case "replay":
-            from modsoft.runtime.tracking.replay import Replay
-
             return Replay(Path(port), robot.modules + 1)
         case _:
             raise UsageError(f"tracker source {settings.source!r} is not supported; use ndi or replay")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from modsoft.runtime import robot as robots
 from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.tracking import ndi
-from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
+from modsoft.runtime.tracking.frame import FrameError, LatestFrame, TrackerFrame
 from modsoft.runtime.tracking.reader import Reader
 from modsoft.runtime.tracking.replay import Replay
 from modsoft.runtime.tracking.sources import open_source
@@ -90,6 +90,25 @@ def test_reader_keeps_the_error_that_ended_it():
     assert str(slot.error) == "cable"
     assert slot.latest().device_frame == 1
     assert source.closed_by == "tracker"
+
+
+def test_reader_continues_after_a_read_without_a_frame():
+    class Failing(Scripted):
+        def read(self):
+            found = super().read()
+            if found is not None and found.device_frame == 2:
+                raise FrameError("wrong checksum")
+            return found
+
+    source, latest = Failing([frame(1), frame(2)]), LatestFrame()
+    reader = Reader(source, latest)
+    assert source.given.wait(5)
+    assert latest.problem == "wrong checksum"
+    assert latest.counts == {"received": 1, "unreadable": 1}
+    latest.put(frame(3))
+    assert latest.problem == ""
+    reader.close()
+    assert latest.error is None
 
 
 def test_closing_does_not_wait_for_a_mute_device():
@@ -181,65 +200,3 @@ def test_the_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ndicapy", None)
     with pytest.raises(DeviceAbsent, match=r"pip install 'modsoft\[ndi\]'"):
         ndi.NDI("polaris", "/dev/null", tools, 4)
-
-
-class Client:
-    """What the NDI client gives, or raises, call by call."""
-
-    def __init__(self, answers):
-        self.answers = iter(answers)
-
-    def get_tool_descriptions(self):
-        return [[10, 11, 12, 13], []]
-
-    def get_frame(self):
-        answer = next(self.answers)
-        if isinstance(answer, Exception):
-            raise answer
-        poses = [np.eye(4)] * 4
-        return [10, 11, 12, 13], [0.0] * 4, [0.0, answer, answer, answer], poses, [0.1] * 4
-
-    def close(self):
-        pass
-
-
-def ndi_with(monkeypatch, tmp_path, answers):
-    tools = [tmp_path / f"{n}.rom" for n in range(4)]
-    for path in tools:
-        path.touch()
-    monkeypatch.setattr(ndi, "_connected", lambda *told: Client(answers))
-    clock = [0.0]
-    return ndi.NDI("polaris", "port", tools, 4, lambda: clock[0], lambda s: clock.__setitem__(0, clock[0] + s)), clock
-
-
-def test_a_hurt_answer_is_waited_out_and_three_in_a_row_are_not(monkeypatch, tmp_path):
-    bad = OSError("Error 0x0101: Bad CRC on reply\n   and more")
-    source, _ = ndi_with(monkeypatch, tmp_path, [5.0, bad, bad, 6.0, bad, bad, bad])
-    assert source.read().device_frame == 5
-    assert [source.read(), source.read()] == [None, None]
-    assert source.read().device_frame == 6
-    assert [source.read(), source.read()] == [None, None]
-    with pytest.raises(DeviceAbsent, match=r"tracker at port: Error 0x0101: Bad CRC on reply$"):
-        source.read()
-
-
-def test_frames_are_asked_for_at_the_devices_pace(monkeypatch, tmp_path):
-    source, clock = ndi_with(monkeypatch, tmp_path, [float(n) for n in range(1, 100)])
-    for _ in range(61):
-        source.read()
-    assert clock[0] == pytest.approx(1.0)
-
-
-def test_poses_are_those_that_the_client_itself_would_make():
-    from sksurgerycore.algorithms.tracking_smoothing import quaternion_to_matrix
-
-    rng = np.random.default_rng(3)
-    quaternions = rng.normal(size=(50, 4))
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    quaternions[7] = np.nan  # a tool that is not seen
-    translations = rng.normal(size=(50, 3))
-    found = ndi.matrices(quaternions, translations)
-    np.testing.assert_allclose(found[:, :3, :3], [quaternion_to_matrix(q) for q in quaternions], atol=1e-15)
-    np.testing.assert_array_equal(found[:, :3, 3], translations)
-    np.testing.assert_array_equal(found[:, 3], np.tile([0, 0, 0, 1], (50, 1)))
-    assert np.isnan(found[7, :3, :3]).all()

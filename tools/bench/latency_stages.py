@@ -3,7 +3,7 @@
 The runtime's own loop runs on the emulated board and the emulated tracker, with a time stamp between any two stages;
 the robot is a row of oscillating poses. The stages:
 
-    frame          from the client's answer (after the tracker's serial line) to a frame that the loop can take
+    frame          from the tracker's complete reply in the client's process to a frame that the loop can take
     configuration  validation, eq. (1), the feature window
     ONNX           the network
     set-points     limits, eq. (3), pressures
@@ -42,8 +42,8 @@ from modsoft.runtime.safety import FrameValidator
 from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Stop
 from modsoft.runtime.tracking.frame import LatestFrame
-from modsoft.runtime.tracking.ndi import NDI
 from modsoft.runtime.tracking.reader import Reader
+from modsoft.runtime.tracking.sources import open_source
 from modsoft.runtime.warmup import WarmUp
 
 HZ = 7.0  # faster than the robot, for many ticks in little time; six tools take 40 ms on the tracker's serial line
@@ -105,14 +105,13 @@ class Stamped:
 class StampedLatestFrame(LatestFrame):
     """Keeps for each frame the times of the tracker's answer and of the frame."""
 
-    def __init__(self, stamps: Stamps):
+    def __init__(self) -> None:
         super().__init__()
-        self._stamps = stamps
         self.frames: dict[int, tuple[float, float]] = {}
 
     def put(self, frame: Any) -> None:
         super().put(frame)
-        self.frames[frame.device_frame] = (self._stamps["tracker"], time.monotonic())
+        self.frames[frame.device_frame] = (frame.answered_s, time.monotonic())
 
 
 class StampedPort:
@@ -137,27 +136,23 @@ class StampedPort:
 
 def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict[str, float]]:
     """Milliseconds of every stage of the ticks that passed all stages. `warm`: with the runtime's warm-up."""
-    import ndicapy
-
     robot, stamps, lines, written = robot_of(modules, HZ), Stamps(), list[Stamps](), list[float]()
-    command, frame_bytes = ndicapy.ndiCommand, len(encode(Set(0, (0,) * CHANNELS)))
+    frame_bytes = len(encode(Set(0, (0,) * CHANNELS)))
     with tempfile.TemporaryDirectory() as folder, EmulatedBoard() as emulated:
         port, tools = Path(folder) / "ttyPolaris", write_tool_files(Path(folder), modules + 1)
         tracker = Child("modsoft.hil.polaris", ["--link", str(port)], lambda line: None)
-        ndicapy.ndiCommand = Stamped(ndicapy, "ndiCommand", stamps, "request", "tracker").ndiCommand
         emulated.send("sensors 50")  # without pressure at the sensors the board would report a leak
         try:
             tracker.wait_ready()
             tracker.send({"poses": oscillating(modules, 0.0)})
-            latest = StampedLatestFrame(stamps)
-            reader = Reader(NDI("polaris", str(port), tools, modules + 1), latest)
+            latest = StampedLatestFrame()
+            reader = Reader(open_source(robot, str(port), tools), latest)
             board = Board(StampedPort(open_port(emulated.port, robot.serial.baud), frame_bytes, written), emulated.port)
             board.arm(robot)
             _run_loop(robot, Model.load(model), latest, board, tracker, count, warm, stamps, lines)
             board.close()
             reader.close()
         finally:
-            ndicapy.ndiCommand = command
             tracker.stop()
         changes = np.array([event["mono_ns"] for event in emulated.trace if event["event"] == "pwm"]) * 1e-9
     wire_s = frame_bytes * 10 / robot.serial.baud

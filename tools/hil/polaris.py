@@ -15,6 +15,11 @@ line, any keys together; its end ends the process:
     {"jump": {"tool": k, "mm": [x, y, z], "deg": d}}   tool k is seen there, turned about its own x axis; null ends it
     {"swap": [j, k]}           two tools are taken for each other; null ends it
     {"corrupt": true}          a wrong checksum on every answer to TX and BX
+    {"damage": {"seed": n, "rate": r, "kinds": [...]}}   bytes of replies flipped, dropped, inserted, delayed while it
+                               tracks (`modsoft.hil.byte_damage`); null ends it
+    {"rms_mm": {"k": e}}       tool k is measured with this RMS error; {} ends it
+    {"port_status": {"k": n}}  tool k has this port status; {} ends it
+    {"five_dof": [k, ...]}     tools whose roll is not measured
     {"mute": true}             no answer to anything
     {"unplug": true}           the port goes away; false brings it back
 
@@ -40,10 +45,9 @@ from typing import Any
 
 import click
 
-from modsoft.hil.polaris_device import Polaris
+from modsoft.hil.polaris_device import FRAME_HZ, Polaris
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import UsageError
-from modsoft.runtime.tracking.ndi import FRAME_HZ
 
 SECONDS_A_BYTE = 10 / 115200
 
@@ -51,8 +55,8 @@ SECONDS_A_BYTE = 10 / 115200
 class Pty:
     """A pseudo-terminal under a name of its own. Its other end is kept open here, so that a client may come and go."""
 
-    def __init__(self, link: Path):
-        self.link = link
+    def __init__(self, link: Path, seconds_a_byte: float = SECONDS_A_BYTE):
+        self.link, self._seconds_a_byte = link, seconds_a_byte
         self.plug()
 
     @property
@@ -84,8 +88,9 @@ class Pty:
         return whole
 
     def write(self, answer: bytes) -> None:
-        """Sends an answer in the time that a line of 115200 baud needs for it."""
-        time.sleep(len(answer) * SECONDS_A_BYTE)
+        """Sends an answer in the time that the line needs for it."""
+        if self._seconds_a_byte:
+            time.sleep(len(answer) * self._seconds_a_byte)
         try:
             os.write(self.master, answer)
         except BlockingIOError:
@@ -163,7 +168,10 @@ def serve(device: Polaris, line: Pty | Network, say: Callable[[dict[str, Any]], 
         if line.master >= 0 and line.master in ready:
             for command in line.commands():
                 tracked = device.tracking
-                line.write(device.answer(command))
+                for pause_s, part in device.sent(device.answer(command)):
+                    if pause_s:
+                        time.sleep(pause_s)
+                    line.write(part)
                 if device.tracking and not tracked:
                     say({"event": "tracking", "mono_ns": time.monotonic_ns()})
 
@@ -194,15 +202,17 @@ def write_tool_files(folder: Path, tools: int) -> list[Path]:
     help="As in the robot file.",
 )
 @click.option("--wired", default=0, help="Tools that are wired to it: aurora.")
-def cli(link: Path, firmware: str, kind: str, wired: int) -> None:
+@click.option("--frame-hz", type=float, help="Frame rate.  [default: 60; aurora: 40]")
+@click.option("--unpaced", is_flag=True, help="Answer at once, not in the time of a serial line.")
+def cli(link: Path, firmware: str, kind: str, wired: int, frame_hz: float | None, unpaced: bool) -> None:
     """A fake optical tracker (started by modsoft-hil)."""
 
     def say(event: dict[str, Any]) -> None:
         sys.stdout.write(json.dumps(event) + "\n")
         sys.stdout.flush()
 
-    device = Polaris(firmware=firmware, kind=kind, wired=wired)
-    line = Network() if kind == "vega" else Pty(link)
+    device = Polaris(firmware=firmware, kind=kind, wired=wired, frame_hz=frame_hz)
+    line = Network() if kind == "vega" else Pty(link, 0.0 if unpaced else SECONDS_A_BYTE)
     try:
         say({"event": "ready", "port": line.address})
         serve(device, line, say, sys.stdin.fileno())

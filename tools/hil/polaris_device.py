@@ -9,22 +9,24 @@ unnoticed otherwise: only enabled tools are reported, and none before TSTART.
 
 from __future__ import annotations
 
-import math
 import struct
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
-from modsoft.runtime.tracking.ndi import FRAME_HZ
+from modsoft.hil.byte_damage import ByteDamage
+from modsoft.hil.rotations import Pose, quaternion, seen_from, turn, turned, without_roll
 
+FRAME_HZ = {"polaris": 60.0, "vega": 60.0, "aurora": 40.0}  # as in NDI's API guides
+AURORA_TURN = (0.9, 0.2, 0.25, 0.3)  # a field generator stands anywhere: no tool has a rotation without roll
 FIRST_HANDLE = 0x0A  # as the wireless tools of the device: a handle is no index
 BX_START = 0xA5C4
 # Answer status, and error codes of the protocol.
 VALID, MISSING = 0x01, 0x02
 BAD_COMMAND, BAD_CRC, BAD_HANDLE, WRONG_MODE = 0x01, 0x04, 0x08, 0x0C
 NO_TOOL, NOT_INITIALISED, NO_SYSTEM = 0x0D, 0x0E, 0x10
-PORT_OK, PORT_MISSING = 0x31, 0x131  # occupied, initialised, enabled; out of volume too
+PORT_OK = 0x31  # occupied, initialised, enabled
 # What PHSR lists, by its option: all, to be freed, to be initialised, to be enabled, enabled.
 LISTED = {
     "00": ("requested", "written", "initialised", "enabled"),
@@ -34,9 +36,9 @@ LISTED = {
     "04": ("enabled",),
 }
 FAULTS = ("hide", "lose", "freeze", "delay_s", "back", "jump", "swap", "corrupt", "mute", "unplug")
+FAULTS_OF_TOOLS = ("rms_mm", "port_status", "five_dof")
+RMS_MM = 0.1
 SAMPLES = 256  # poses kept for a delayed device: five seconds at the rig's 50 Hz
-
-Pose = list[list[float]]
 
 
 def crc16(data: bytes) -> int:
@@ -47,32 +49,6 @@ def crc16(data: bytes) -> int:
         for _ in range(8):
             crc = (crc >> 1) ^ 0xA001 if crc & 1 else crc >> 1
     return crc
-
-
-def quaternion(pose: Pose) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z), w >= 0, of a pose's rotation: the largest component first, so that none is lost."""
-    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in pose[:3])
-    squares = [1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i]  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
-    largest = max(range(4), key=squares.__getitem__)
-    products = [
-        (squares[0], h - f, c - g, d - b),
-        (h - f, squares[1], b + d, c + g),
-        (c - g, b + d, squares[2], f + h),
-        (d - b, c + g, f + h, squares[3]),
-    ][largest]
-    scale = math.sqrt(sum(value * value for value in products)) * (1 if products[0] >= 0 else -1)
-    w, x, y, z = (value / scale for value in products)
-    return w, x, y, z
-
-
-def turned(pose: Pose, mm: list[float], deg: float) -> Pose:
-    """A pose moved by `mm` in the tracker's frame and turned about its own x axis."""
-    cos, sin = math.cos(math.radians(deg)), math.sin(math.radians(deg))
-    rows = [
-        [row[0], row[1] * cos + row[2] * sin, row[2] * cos - row[1] * sin, row[3] + mm[axis]]
-        for axis, row in enumerate(pose[:3])
-    ]
-    return [*rows, [0.0, 0.0, 0.0, 1.0]]
 
 
 class Refused(Exception):
@@ -92,14 +68,18 @@ class Polaris:
         firmware: str = "Polaris Spectra Rev 009",
         kind: str = "polaris",
         wired: int = 0,
+        frame_hz: float | None = None,
     ):
         """`firmware`: with "Rev 007" at its end the client asks for TX in place of BX. `kind`: as in the robot file;
-        `wired`: number of tools that need no definition file."""
+        `wired`: number of tools that need no definition file; `frame_hz`: of the frame numbers, if not that of the
+        kind."""
         self.now = now
-        self._frame_hz = FRAME_HZ[kind]
+        self._frame_hz = frame_hz or FRAME_HZ[kind]
+        self._turn = turn(AURORA_TURN) if kind == "aurora" else None
         self._wired = {FIRST_HANDLE + tool: "written" for tool in range(wired)}
         self.firmware = firmware
         self.faults: dict[str, Any] = {}
+        self._damage: ByteDamage | None = None
         self.commands: Counter[str] = Counter()
         self.frames = 0
         self.tracking = False
@@ -115,9 +95,12 @@ class Polaris:
         if "poses" in line:
             self._samples.append((self.now(), line.pop("poses")))
         for name, value in line.items():
-            if name not in FAULTS:
-                raise ValueError(f"no fault is called {name!r}; known: {', '.join(FAULTS)}")
+            known = (*FAULTS, *FAULTS_OF_TOOLS, "damage")
+            if name not in known:
+                raise ValueError(f"no fault is called {name!r}; known: {', '.join(known)}")
             self.faults[name] = value
+            if name == "damage":
+                self._damage = ByteDamage(**value) if value else None
         if not self.faults.get("freeze"):
             self._frozen = None
         elif self._frozen is None:
@@ -142,6 +125,12 @@ class Polaris:
         except Refused as refused:
             text = str(refused)
         return self._sealed(text, spoilt=name == "TX")
+
+    def sent(self, reply: bytes) -> list[tuple[float, bytes]]:
+        """The parts of a reply as the line sends them, each with a pause in seconds before it."""
+        if self._damage is None or not self.tracking or not reply:
+            return [(0.0, reply)]
+        return self._damage.apply(reply)
 
     def _sealed(self, text: str, spoilt: bool = False) -> bytes:
         crc = crc16(text.encode()) ^ (0x5A5A if spoilt and self.faults.get("corrupt") else 0)
@@ -226,6 +215,8 @@ class Polaris:
             jump = self.faults.get("jump")
             if pose is not None and jump and jump["tool"] == tool:
                 pose = turned(pose, jump.get("mm", [0.0, 0.0, 0.0]), jump.get("deg", 0.0))
+            if pose is not None and self._turn is not None:
+                pose = seen_from(self._turn, pose)
             rows.append((handle, pose, number))
         return rows
 
@@ -243,13 +234,21 @@ class Polaris:
         text = f"{len(rows):02X}"
         for handle, pose, number in rows:
             text += f"{handle:02X}"
+            tool = list(self._tools).index(handle)
             if pose is None:
-                text += f"MISSING{PORT_MISSING:08X}{number:08X}\n"
+                text += "MISSING"
             else:
-                text += "".join(f"{round(value * 1e4):+06d}" for value in quaternion(pose))
+                q = quaternion(pose)
+                q = without_roll(q) if tool in self.faults.get("five_dof", ()) else q
+                text += "".join(f"{round(value * 1e4):+06d}" for value in q)
                 text += "".join(f"{round(pose[axis][3] * 1e2):+07d}" for axis in range(3))
-                text += f"{round(0.1 * 1e4):+06d}{PORT_OK:08X}{number:08X}\n"
+                text += f"{round(self._of_tool('rms_mm', tool, RMS_MM) * 1e4):+06d}"
+            text += f"{self._of_tool('port_status', tool, PORT_OK):08X}{number:08X}\n"
         return text + "0000"
+
+    def _of_tool(self, fault: str, tool: int, otherwise: Any) -> Any:
+        """What a fault of the form {tool: value} has for this tool."""
+        return (self.faults.get(fault) or {}).get(str(tool), otherwise)
 
     def _bx(self, rows: list[tuple[int, Pose | None, int]]) -> bytes:
         body = bytes([len(rows)])
@@ -257,7 +256,7 @@ class Polaris:
             body += bytes([handle, MISSING if pose is None else VALID])
             if pose is not None:
                 body += struct.pack("<8f", *quaternion(pose), *(pose[axis][3] for axis in range(3)), 0.1)
-            body += struct.pack("<II", PORT_MISSING if pose is None else PORT_OK, number)
+            body += struct.pack("<II", PORT_OK, number)
         body += struct.pack("<H", 0)
         header = struct.pack("<HH", BX_START, len(body))
         crc = crc16(body) ^ (0x5A5A if self.faults.get("corrupt") else 0)
