@@ -1,4 +1,4 @@
-"""What the attacks share. Every file is a real one: where that can be shown, it does its harm to a careless reader."""
+"""Fixtures of the attacks. Where it can be shown, a test verifies that an unprotected reader is harmed by the file."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ from modsoft.runtime.errors import ModelError
 
 
 class Evil:
-    """Pickled, it makes the folder `path` in whoever unpickles it."""
+    """Makes the folder `path` when it is unpickled."""
 
     def __init__(self, path):
         self.path = str(path)
@@ -19,28 +19,28 @@ class Evil:
 
 
 @pytest.fixture
-def mark(tmp_path):
-    """What the attack makes."""
+def harm(tmp_path):
+    """The folder that the attack makes."""
     return tmp_path / "harm"
 
 
 @pytest.fixture
-def evil(mark):
-    """An object that makes `mark` when it is unpickled."""
-    return Evil(mark)
+def evil(harm):
+    """An object that makes `harm` when it is unpickled."""
+    return Evil(harm)
 
 
 @pytest.fixture
 def refused():
-    """refused(read, path, says) expects one line with exit code 65, and no advice to read the file all the same."""
+    """refused(read, path, message) expects one line with exit code 65, without advice to load the file unsafely."""
 
-    def check(read, path, says="."):
-        with pytest.raises(ModelError, match=says) as told:
+    def check(read, path, message="."):
+        with pytest.raises(ModelError, match=message) as caught:
             read(path)
-        assert told.value.exit_code == 65
-        assert len(str(told.value).splitlines()) == 1
-        assert "weights_only" not in str(told.value)
-        assert "allow_pickle" not in str(told.value)
+        assert caught.value.exit_code == 65
+        assert len(str(caught.value).splitlines()) == 1
+        assert "weights_only" not in str(caught.value)
+        assert "allow_pickle" not in str(caught.value)
 
     return check
 
@@ -51,8 +51,8 @@ def ended(monkeypatch, capfd):
 
     def run(main, *arguments):
         monkeypatch.setattr(sys, "argv", ["command", *map(str, arguments)])
-        with pytest.raises(SystemExit) as told:
+        with pytest.raises(SystemExit) as caught:
             main()
-        return told.value.code, capfd.readouterr().err.splitlines()
+        return caught.value.code, capfd.readouterr().err.splitlines()
 
     return run

@@ -1,4 +1,4 @@
-"""A data set from a stranger reads nothing but itself, and is refused in one line."""
+"""An untrusted data set reads no other file, and is refused in one line."""
 
 import h5py
 import numpy as np
@@ -13,7 +13,7 @@ from modsoft.training.data import dataset
 
 @pytest.fixture
 def data_file(tmp_path):
-    """A small data set that is sound so far."""
+    """A small valid data set."""
     robot = robots.load("pneumatic-2")
     generation = {"robot": robot.to_dict(), "strategy": "random", "steps": 3}
     configuration = np.tile([0.0, 0.0, 1.0], (2, 4, 2, 1))
@@ -24,7 +24,7 @@ def data_file(tmp_path):
 
 
 def other_file(folder):
-    """A file of the victim's that holds sound numbers, for two modules."""
+    """Private files with valid values for two modules."""
     (folder / "private").write_bytes(np.zeros((2, 3, 2, 1)).tobytes())
     with h5py.File(folder / "private.h5", "w") as file:
         file["action"] = np.zeros((2, 3, 2, 1))
@@ -67,7 +67,7 @@ def a_group(file, folder):
 
 
 @pytest.mark.parametrize(
-    ("attack", "says"),
+    ("attack", "message"),
     [
         (linked, "action is a link"),
         (soft_linked, "action is a link"),
@@ -79,30 +79,30 @@ def a_group(file, folder):
         (compressed, "action claims 32000000 bytes"),
     ],
 )
-def test_a_data_set_that_points_elsewhere_or_claims_too_much(tmp_path, data_file, attack, says, refused):
+def test_data_set_with_links_or_claimed_sizes_is_refused(tmp_path, data_file, attack, message, refused):
     folder = other_file(tmp_path)
     with h5py.File(data_file, "r+") as file:
         del file["action"]
         attack(file, folder)
         if attack in (linked, soft_linked, stored_elsewhere, virtual):
-            assert file["action"][()].shape == (2, 3, 2, 1), "whoever does not look follows it"
-    refused(dataset.read, data_file, says)
-    refused(dataset.read_header, data_file, says)
+            assert file["action"][()].shape == (2, 3, 2, 1), "an unprotected reader follows it"
+    refused(dataset.read, data_file, message)
+    refused(dataset.read_header, data_file, message)
 
 
 @pytest.mark.parametrize(
     ("main", "before", "after"),
     [(train_cli.main, [], ["--out", "model.pt"]), (collect_cli.main, ["plot"], ["--out", "picture.png"])],
 )
-def test_the_commands_end_with_65(tmp_path, monkeypatch, data_file, main, before, after, ended):
+def test_commands_exit_with_65(tmp_path, monkeypatch, data_file, main, before, after, ended):
     monkeypatch.chdir(tmp_path)
     with h5py.File(data_file, "r+") as file:
         del file["action"]
         linked(file, other_file(tmp_path))
-    before_it = set(tmp_path.iterdir())
-    code, said = ended(main, *before, data_file, *after)
-    assert (code, len(said)) == (65, 1)
-    assert set(tmp_path.iterdir()) == before_it
+    files_before = set(tmp_path.iterdir())
+    code, lines = ended(main, *before, data_file, *after)
+    assert (code, len(lines)) == (65, 1)
+    assert set(tmp_path.iterdir()) == files_before
 
 
 def npy(shape, descr):
@@ -116,26 +116,26 @@ def npy(shape, descr):
     [npy("(10000000000000, 2, 1)", "'<f8'"), npy("(3, 2, 1)", "'|O'"), npy("(3,)", "'" + "f8," * 100), b"\x93NUMPY"],
     ids=["huge", "objects", "no end", "cut"],
 )
-def test_headers_that_claim_too_much(tmp_path, content, ended):
-    """As actions, and as the task of the real loop, where a wrong file is a wrong order: 2."""
+def test_arrays_with_claimed_sizes_are_refused(tmp_path, content, ended):
+    """As actions (exit code 65), and as the task of the control loop (exit code 2)."""
     path = tmp_path / "a.npy"
     path.write_bytes(content)
-    code, said = ended(simulate_cli.main, "--robot", "pneumatic-2", "--actions", path, "--out", tmp_path / "o")
-    assert (code, len(said)) == (65, 1)
+    code, lines = ended(simulate_cli.main, "--robot", "pneumatic-2", "--actions", path, "--out", tmp_path / "o")
+    assert (code, len(lines)) == (65, 1)
     with pytest.raises(UsageError, match=r"^task file [^\n]*: not a readable .npy array"):
         load_task(str(path), robots.load("pneumatic-2"))
 
 
-def test_actions_that_are_a_pickle_end_modsoft_simulate_with_65(tmp_path, mark, evil, ended):
+def test_pickled_actions_are_refused(tmp_path, harm, evil, ended):
     np.save(tmp_path / "a.npy", np.array([[[evil]]]), allow_pickle=True)
-    order = ["--robot", "pneumatic-2", "--actions", tmp_path / "a.npy", "--out", tmp_path / "o"]
-    code, said = ended(simulate_cli.main, *order)
-    assert (code, len(said)) == (65, 1)
-    assert not mark.exists()
+    arguments = ["--robot", "pneumatic-2", "--actions", tmp_path / "a.npy", "--out", tmp_path / "o"]
+    code, lines = ended(simulate_cli.main, *arguments)
+    assert (code, len(lines)) == (65, 1)
+    assert not harm.exists()
 
 
 @pytest.mark.parametrize("generation", ["", "[]", "{}", '{"robot": 1}', '{"robot": {}}', "[" * 10**5, "null"])
-def test_a_data_set_that_does_not_say_what_it_is_of(data_file, generation, refused):
+def test_data_set_with_invalid_settings_is_refused(data_file, generation, refused):
     with h5py.File(data_file, "r+") as file:
         file.attrs["generation"] = generation
     refused(dataset.read, data_file)

@@ -1,5 +1,5 @@
-"""The folder of an unfinished collection, when a stranger had it: what is odd in it is made again, what reaches out of
-it is refused, and nothing outside it changes."""
+"""An untrusted folder of an unfinished collection: invalid episodes are generated again, links out of it are refused,
+and nothing outside it changes."""
 
 import json
 import pickle
@@ -31,7 +31,7 @@ def collected(out):
 
 @pytest.fixture
 def parts(tmp_path):
-    """The folder as a collection begins it."""
+    """The folder of a collection that has started."""
     folder = tmp_path / "d.h5.parts"
     folder.mkdir()
     generation = collect.generation_settings(ROBOT, "random", 0, 10, "still")
@@ -41,7 +41,7 @@ def parts(tmp_path):
 
 @pytest.fixture
 def private(tmp_path):
-    """A file of the victim's."""
+    """A private file."""
     path = tmp_path / "private"
     path.write_text("mine")
     return path
@@ -77,14 +77,14 @@ def test_folder_in_the_place_of_an_episode_is_refused(tmp_path, parts, name):
         collected(tmp_path / "d.h5")
 
 
-def test_a_pickle_among_the_episodes_is_not_run(tmp_path, parts, mark, evil):
+def test_pickled_episode_is_not_run(tmp_path, parts, harm, evil):
     np.savez(parts / "episode-000000.npz", configuration=np.array([evil]), action=np.zeros((10, 2, 1)), rejected=0)
     collected(tmp_path / "d.h5")
-    assert not mark.exists()
+    assert not harm.exists()
 
 
-def test_results_of_jobs_that_were_there_before_are_not_unpickled(tmp_path, parts, mark, evil, monkeypatch):
-    """submitit unpickles NUMBER_0_result.pkl, and the numbers of a cluster can be foreseen."""
+def test_earlier_results_of_jobs_are_not_unpickled(tmp_path, parts, harm, evil, monkeypatch):
+    """submitit unpickles NUMBER_0_result.pkl, and job numbers are predictable."""
     submitit = pytest.importorskip("submitit", reason="extra slurm")
     folders = []
 
@@ -94,9 +94,9 @@ def test_results_of_jobs_that_were_there_before_are_not_unpickled(tmp_path, part
 
     monkeypatch.setattr(submitit.AutoExecutor, "map_array", caught)
     for _ in range(2):
-        for there in folders:  # an attacker may know the folders of earlier runs
-            there.mkdir(exist_ok=True)
-            (there / "1_0_result.pkl").write_bytes(pickle.dumps(("success", evil)))
+        for folder in folders:  # an attacker may know the folders of earlier runs
+            folder.mkdir(exist_ok=True)
+            (folder / "1_0_result.pkl").write_bytes(pickle.dumps(("success", evil)))
         with pytest.raises(InUse, match="caught"):
             collect.collect(
                 ROBOT,
@@ -125,7 +125,7 @@ def test_links_are_not_followed(tmp_path, parts, private, refused):
     assert private.read_text() == "mine"
 
 
-def test_a_folder_that_is_a_link_is_refused(tmp_path, refused):
+def test_folder_that_is_a_link_is_refused(tmp_path, refused):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / ".mine.tmp").touch()
     (tmp_path / "d.h5.parts").symlink_to(tmp_path / "elsewhere")
@@ -136,7 +136,7 @@ def test_a_folder_that_is_a_link_is_refused(tmp_path, refused):
 @pytest.mark.parametrize(
     "name", ["episode-.npz", "episode-x.npz", "episode--00001.npz", "episode-0000000.npz", "episode-٠٠٠٠٠٠.npz", "..."]
 )
-def test_other_names_are_left_alone(tmp_path, parts, name):
+def test_files_of_other_names_are_kept(tmp_path, parts, name):
     (parts / name).touch()
     assert Shards(parts).finished() == set()
     collected(tmp_path / "d.h5")
@@ -148,10 +148,10 @@ def test_invalid_generation_settings_are_refused(tmp_path, parts, generation, re
     refused(collected, tmp_path / "d.h5", "generation")
 
 
-# ---- Two at a time --------------------------------------------------------------------------------------------------
+# ---- Concurrent runs ------------------------------------------------------------------------------------------------
 
 
-def test_two_collections_do_not_work_on_the_same_data_set(tmp_path, parts):
+def test_second_collection_of_a_data_set_is_refused(tmp_path, parts):
     with Shards(parts).held(tmp_path / "d.h5"):
         with pytest.raises(InUse, match=r"d\.h5: another modsoft-collect works on it") as refused:
             collected(tmp_path / "d.h5")
@@ -171,7 +171,7 @@ def test_two_collections_do_not_work_on_the_same_data_set(tmp_path, parts):
         ("dask", "security=true"),
     ],
 )
-def test_a_wrong_order_makes_nothing_and_shows_no_bar(tmp_path, backend, option):
+def test_wrong_options_make_no_file_and_show_no_bar(tmp_path, backend, option):
     pytest.importorskip({"local": "numpy", "submitit": "submitit", "dask": "dask_jobqueue"}[backend])
     found = subprocess.run(
         [

@@ -1,4 +1,4 @@
-"""Nothing that runs here listens where another machine could speak to it."""
+"""No process accepts connections from other machines."""
 
 import os
 import subprocess
@@ -18,41 +18,41 @@ LOOPBACK = ("0100007F", "00000000000000000000000001000000", "0000000000000000FFF
 
 
 def listening(pids):
-    """Addresses ADDRESS:PORT, hexadecimal, on which any of the processes takes connections or packets."""
+    """Addresses ADDRESS:PORT, hexadecimal, on which the processes accept connections or packets."""
     sockets = set()
     for pid in pids:
         for descriptor in Path(f"/proc/{pid}/fd").iterdir():
             try:
                 sockets.add(os.readlink(descriptor))
             except FileNotFoundError:
-                pass  # closed meanwhile
-    found = set()
+                pass  # closed in the meantime
+    addresses = set()
     for kind in ("tcp", "tcp6", "udp", "udp6"):
         for line in Path(f"/proc/net/{kind}").read_text().splitlines()[1:]:
             _, address, _, state, *_, inode = line.split()[:10]
             if f"socket:[{inode}]" in sockets and (state == LISTENING or kind.startswith("udp")):
-                found.add(address)
-    return found
+                addresses.add(address)
+    return addresses
 
 
-def elsewhere(addresses):
+def reachable(addresses):
     return {address for address in addresses if address.partition(":")[0] not in LOOPBACK}
 
 
-def test_a_port_for_everybody_is_seen():
+def test_public_port_is_detected():
     script = "import socket, sys; s = socket.create_server(('', 0)); print('ready', flush=True); sys.stdin.read()"
     with subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as server:
         assert server.stdout.readline() == "ready\n"
-        assert len(elsewhere(listening([server.pid]))) == 1
+        assert len(reachable(listening([server.pid]))) == 1
         server.stdin.close()
 
 
 @pytest.mark.realtime
 @pytest.mark.parametrize(("tracker", "ports"), [("aurora", 0), ("vega", 1)])
-def test_a_run_on_the_rig_listens_for_this_machine_alone(tracker, ports, tmp_path, model_file):
-    """A vega is a device of the network, and so is the fake one."""
+def test_run_on_the_rig_listens_on_loopback_only(tracker, ports, tmp_path, model_file):
+    """A vega is a network device, and so is its emulation."""
     robot = tmp_path / "robot.toml"
     robot.write_text(robots.text_of("pneumatic-3").replace('type = "polaris"', f'type = "{tracker}"'))
     with Rig(robot, tmp_path / "out", board="native") as rig:
@@ -64,7 +64,7 @@ def test_a_run_on_the_rig_listens_for_this_machine_alone(tracker, ports, tmp_pat
         assert rig.runtime.pid in running
         assert len(running) >= 4, "board, tracker, robot, runtime"
         assert len(listening(running)) == ports
-        assert elsewhere(listening(running)) == set()
+        assert reachable(listening(running)) == set()
 
 
 DASK = """
@@ -84,8 +84,8 @@ if __name__ == "__main__":
     [("{}", 0), ('{"cluster": "SLURMCluster", "cores": 1, "memory": "1GB"}', 1)],
     ids=["local", "cluster"],
 )
-def test_dask_listens_to_this_machine_or_to_its_workers_alone(tmp_path, options, open_to_others):
-    """A cluster's workers reach the scheduler's one port; its dashboard and everything of a local one stay here."""
+def test_dask_listens_on_loopback_or_for_its_workers_only(tmp_path, options, open_to_others):
+    """The workers of a cluster reach one port of the scheduler; the dashboard and a local cluster are on loopback."""
     pytest.importorskip("dask_jobqueue", reason="extra dask")
     (tmp_path / "sbatch").write_text("#!/bin/sh\necho Submitted batch job 1\n")
     (tmp_path / "sbatch").chmod(0o755)
@@ -100,7 +100,7 @@ def test_dask_listens_to_this_machine_or_to_its_workers_alone(tmp_path, options,
         env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"},
     ) as dask:
         assert dask.stdout.readline() == "ready\n"
-        found = listening([dask.pid, *descendants(dask.pid)])
+        addresses = listening([dask.pid, *descendants(dask.pid)])
         dask.stdin.close()
-    assert len(found) >= 2
-    assert len({address.rpartition(":")[2] for address in elsewhere(found)}) == open_to_others
+    assert len(addresses) >= 2
+    assert len({address.rpartition(":")[2] for address in reachable(addresses)}) == open_to_others

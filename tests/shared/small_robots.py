@@ -1,4 +1,4 @@
-"""Robots of any kind and module number, without a file of their own."""
+"""Robots of any kind and number of modules, without a robot file."""
 
 from modsoft.runtime import robot as robots
 
