@@ -25,8 +25,8 @@ needs_fleet = pytest.mark.skipif(not fleet_kernel.variants(), reason="the fleet'
 def test_a_shipped_model_is_of_its_robots_and_says_how_it_was_made(file, robot):
     controller = Model.load(MODELS / f"{file}.onnx")
     controller.check(robots.load(robot))
-    said = controller.description.provenance
-    assert {"data_sha256", "iterations_done", "seed", "strategy", "code_version"} <= said.keys()
+    provenance = controller.description.provenance
+    assert {"data_sha256", "iterations_done", "seed", "strategy", "code_version"} <= provenance.keys()
     assert f"{file}.onnx" in (MODELS / "README.md").read_text(encoding="utf-8")
 
 
@@ -41,9 +41,9 @@ def test_a_shipped_model_drives_its_robot(file, robot, task, most):
     robot = robots.load(robot)
     controller = Model.load(MODELS / f"{file}.onnx")
     desired = tasks.task(task, robot.kind, robot.modules)[:60]
-    pilot = ControllerSetup(robot, controller.actuate, controller.history, desired)
-    (flight,) = rollout.rollout(Fleet(robot.kind, robot.modules, 1), [pilot]).robots()
+    setup = ControllerSetup(robot, controller.actuate, controller.history, desired)
+    (driven,) = rollout.rollout(Fleet(robot.kind, robot.modules, 1), [setup]).robots()
     errors = rollout.angle_errors_deg if robot.kind == "pneumatic" else rollout.configuration_errors_percent
-    assert errors(flight.configuration, desired).mean(axis=0).max() < most
-    still = np.broadcast_to(flight.configuration[:1], (61, robot.modules, 3))
+    assert errors(driven.configuration, desired).mean(axis=0).max() < most
+    still = np.broadcast_to(driven.configuration[:1], (61, robot.modules, 3))
     assert errors(still, desired).mean(axis=0).max() > 2 * most

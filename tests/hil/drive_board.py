@@ -1,11 +1,11 @@
 """A bare host for the emulated board, run as a process of its own so that it can be killed.
 
-`python drive_board.py PORT PRESSURE_BAR...`: opens the port, waits in silence for HELLO, beats, arms, then sends these
-pressures (one for each channel from 0 on, the others 0) ten times a second for ever. Standard output, one JSON object
-a line: {"hello": ..., "after_s": ...} and then {"status": ...} for every STATUS.
-With no pressures it only listens; with `--heartbeats N` it sends N frames as fast as the line takes them, once.
+`python drive_board.py PORT PRESSURE_BAR...`: opens the port, waits in silence for HELLO, sends heartbeats, arms, then
+sends these pressures (one for each channel from 0 on, the others 0) ten times a second until it is killed. Standard
+output, one JSON object a line: {"hello": ..., "after_s": ...} and then {"status": ...} for every STATUS.
+Without pressures it only reads; with `--heartbeats N` it sends N frames as fast as the line takes them, once.
 
-It uses `modsoft.runtime.board.protocol` alone, so that the board is judged without the runtime's host side.
+It uses only `modsoft.runtime.board.protocol`, so that the board is tested without the rest of the runtime.
 """
 
 import json

@@ -78,7 +78,7 @@ def test_analogue_input_reads_what_was_set(probe: Path, millivolt: int) -> None:
 
 
 @pytest.mark.usefixtures("simavr")
-def test_time_goes_on_over_a_chip_asleep_for_ever(probe: Path) -> None:
+def test_time_continues_while_the_chip_sleeps(probe: Path) -> None:
     with EmulatedBoard("simavr", firmware=probe, bootloader=False) as board:
         chip = Probe(board)
         chip.port.write(b"s")

@@ -12,7 +12,7 @@ from modsoft.runtime.control.actuation import channel_pressures_bar, pressures_b
 from modsoft.runtime.control.features import from_directors, from_poses
 
 
-class StandIn:
+class RigidArm:
     """An arm whose chambers are at their set-points at once and whose modules bend by the difference, 1 rad a bar."""
 
     def __init__(self, modules):
@@ -61,7 +61,7 @@ def test_no_duty_is_no_pressure(robot):
 
 
 def test_the_tracker_sees_the_configuration(robot):
-    arm = StandIn(3)
+    arm = RigidArm(3)
     arm.set_pressures([[0.3, 0.08], [0.08, 0.35], [0.2, 0.1]])
     poses = tool_poses(arm.positions, arm.directors)
     np.testing.assert_allclose(from_poses(poses), arm.configuration, atol=1e-12)
@@ -72,7 +72,7 @@ def test_the_tracker_sees_the_configuration(robot):
 
 
 class Time:
-    """Virtual time: sleeping moves it on, and so does work that is told to take long."""
+    """Virtual time: advanced by sleeping, and by the test."""
 
     def __init__(self):
         self.now_ns = 1_000_000
@@ -85,7 +85,7 @@ class Time:
 
 
 def test_slices_keep_to_absolute_deadlines_and_catch_up(robot):
-    time, lines, arm = Time(), [], StandIn(3)
+    time, lines, arm = Time(), [], RigidArm(3)
     start = time.now_ns
 
     def duties():
@@ -106,7 +106,7 @@ def test_slices_keep_to_absolute_deadlines_and_catch_up(robot):
 
 
 def test_duties_are_held_until_new_ones_come(robot):
-    lines, arm, time = [], StandIn(3), Time()
+    lines, arm, time = [], RigidArm(3), Time()
     full = np.full(12, 0.1)
     run(ValvesAndArm(robot, arm), iter([None, full, None]), lines.append, time.clock_ns, time.sleep)
     pressures = [np.max(line["pressure_bar"]) for line in lines if line["event"] == "state"]
@@ -132,6 +132,6 @@ def test_the_newest_duties_of_the_pipe_win_and_its_end_ends():
 
 def test_every_line_is_json(robot):
     lines = []
-    stepped = ValvesAndArm(robot, StandIn(3))
+    stepped = ValvesAndArm(robot, RigidArm(3))
     run(stepped, iter([np.full(12, 0.1)]), lambda line: lines.append(json.dumps(line)), sleep=lambda seconds: None)
     assert [json.loads(line)["event"] for line in lines] == ["ready", "state", "summary"]

@@ -58,13 +58,13 @@ def wait_until(true, timeout_s):
 def run(folder, robot, model, steps):
     """The record of a short run, which meets every criterion but its length."""
     wanted = folder / "down.npy"  # a random controller is not held to the limits of a task's name
-    asked = load_task("down", robots.load(robot))[:steps]
-    np.save(wanted, asked)
+    reference = load_task("down", robots.load(robot))[:steps]
+    np.save(wanted, reference)
     with Rig(robot, folder) as rig:
         rig.run(model, str(wanted))
         rig.wait(60)
         rig.settle(1.5)
-    return record.read(folder, rig.run_folder(), rig.robot, wanted.name, asked, rig.runtime.returncode)
+    return record.read(folder, rig.run_folder(), rig.robot, wanted.name, reference, rig.runtime.returncode)
 
 
 def as_in_collection(found, run_folder):
@@ -82,7 +82,7 @@ def as_in_collection(found, run_folder):
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("robot", ["pneumatic-3", "pneumatic-2"])
-def test_a_model_of_three_modules_runs_robots_of_three_and_two(robot, strong_model, tmp_path):
+def test_model_of_three_modules_runs_robots_of_three_and_two(robot, strong_model, tmp_path):
     found = run(tmp_path, robot, strong_model, steps=20)
     assessment = criteria.assess(found)
     table = "\n".join(f"{line.met}  {line.name}: {line.measured} ({line.limit})" for line in assessment.criteria)
@@ -96,8 +96,8 @@ def test_a_model_of_three_modules_runs_robots_of_three_and_two(robot, strong_mod
 
 
 @pytest.mark.realtime
-def test_a_killed_runtime_leaves_every_valve_at_0_within_700_ms(strong_model, tmp_path):
-    """The board does it alone. Random phases of the control period, from the highest pressure."""
+def test_board_vents_within_700_ms_after_the_runtime_is_killed(strong_model, tmp_path):
+    """Random phases of the control period, from the highest pressure."""
     worst_ms = 0.0
     phases = random.Random(0)
     with Rig("pneumatic-3", tmp_path) as rig:
@@ -219,7 +219,7 @@ def test_an_exception_inside_ends_everything(model_file, tmp_path):
     assert not [pid for pid in below if alive(pid)]
 
 
-# ---- What is wrong is said in one line, before anything moves
+# ---- Errors before a run: one line
 
 
 @pytest.fixture(scope="module")
@@ -257,12 +257,12 @@ def damaged(model, folder):
         ("model", 65, "damaged.onnx"),
         ("no model", 65, "none.onnx"),
         ("port", 69, "ttyNone"),
-        ("port not told", 2, "--port"),
+        ("no port", 2, "--port"),
         ("tracker", 69, "ttyNoTracker"),
-        ("tracker not told", 2, "--tracker-port"),
+        ("no tracker port", 2, "--tracker-port"),
     ],
 )
-def test_what_is_wrong_is_one_line_with_its_own_exit_code(wrong, code, says, model_file, tracker, tmp_path):
+def test_error_is_one_line_with_its_own_exit_code(wrong, code, says, model_file, tracker, tmp_path):
     port, tools = tracker
     options = {"--robot": "pneumatic-3", "--model": model_file, "--task": "down"}
     options |= {"--port": port, "--tracker-port": port}  # any port that exists: the board's is opened last
@@ -280,23 +280,25 @@ def test_what_is_wrong_is_one_line_with_its_own_exit_code(wrong, code, says, mod
             options["--model"] = tmp_path / "none.onnx"
         case "port":
             options["--port"] = tmp_path / "ttyNone"
-        case "port not told":
+        case "no port":
             del options["--port"]
-        case "tracker not told":
+        case "no tracker port":
             del options["--tracker-port"]
         case "tracker":
             options["--tracker-port"] = tmp_path / "ttyNoTracker"
-    found, said = script("modsoft-runtime", "--yes", *tools, *(part for pair in options.items() for part in pair))
-    assert (found, len(said.splitlines())) == (code, 1), said
-    assert says in said
+    exit_code, message = script(
+        "modsoft-runtime", "--yes", *tools, *(part for pair in options.items() for part in pair)
+    )
+    assert (exit_code, len(message.splitlines())) == (code, 1), message
+    assert says in message
 
 
 @pytest.mark.parametrize(
     ("option", "value", "code"), [("--robot", "cable-4", 64), ("--model", "none.onnx", 65), ("--task", "jump", 2)]
 )
-def test_the_rig_starts_nothing_for_a_wrong_order(option, value, code, model_file, tmp_path):
+def test_rig_starts_nothing_with_a_wrong_option(option, value, code, model_file, tmp_path):
     options = {"--robot": "pneumatic-3", "--model": model_file, "--task": "down", "--report": tmp_path / "out"}
     options[option] = value
-    found, said = script("modsoft-hil", *(part for pair in options.items() for part in pair), cwd=tmp_path)
-    assert (found, len(said.splitlines())) == (code, 1), said
+    exit_code, message = script("modsoft-hil", *(part for pair in options.items() for part in pair), cwd=tmp_path)
+    assert (exit_code, len(message.splitlines())) == (code, 1), message
     assert not (tmp_path / "out").exists()

@@ -22,7 +22,7 @@ def hello_at_s(port: SteppedPort) -> float:
 def test_time_stands_still_between_two_steps(board_name: str) -> None:
     with EmulatedBoard(board_name, stepped=True) as board:
         board.run(1500, 0)
-        before_us = board.ran["t_us"]
+        before_us = board.last_run["t_us"]
         time.sleep(0.05)
         board.send("stats")
         assert board.wait_for(is_event("stats"), 5)["t_us"] == before_us == pytest.approx(1500, abs=1)
@@ -33,7 +33,7 @@ def test_every_opening_takes_the_same_time(board_name: str) -> None:
     took_s = []
     with EmulatedBoard(board_name, stepped=True) as board:
         for _ in range(3):
-            opened_s = board.ran["t_us"] * 1e-6
+            opened_s = board.last_run["t_us"] * 1e-6
             took_s.append(hello_at_s(SteppedPort(board)) - opened_s)
             board.run(1000, 0)
     assert len([event for event in board.trace if event["event"] == "uart-open"]) == 3
@@ -47,7 +47,7 @@ def test_what_was_written_is_there_in_the_next_step(board_name: str) -> None:
         for number in range(1, 6):
             port.write(bytes(40))
             port.idle(0.01)  # 40 bytes take 1.6 ms
-            assert board.ran["from_host"] == 40 * number
+            assert board.last_run["from_host"] == 40 * number
         assert port.in_waiting > 0
         port.close()
     assert board.summary["rx"] == 200

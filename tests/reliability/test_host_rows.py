@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mega_in_run import side_by_side
-from runtime_in_run import Run, Stand, if_begun
+from runtime_in_run import Run, Stand, retry_until_begun
 from virtual_loop import PERIOD_S, World
 
 from modsoft.runtime import log as logs
@@ -89,7 +89,7 @@ def test_row_25_disk_full_in_a_run(matrix_row, full, model_file, tmp_path):
     """The kernel refuses to make any file of the process longer, from some instant on."""
     phases_s = np.random.default_rng(25).uniform(0.0, 2.0, 20 if full else 3)
 
-    @if_begun
+    @retry_until_begun
     def attempt(number):
         with Stand() as stand, Run(stand, model_file, tmp_path / str(number), "--steps", "15") as run:
             run.wait_for(lambda: run.ticks() >= 2)
@@ -97,13 +97,13 @@ def test_row_25_disk_full_in_a_run(matrix_row, full, model_file, tmp_path):
             [path] = run.runs.glob("*/run.jsonl")
             room = (path.stat().st_size + 100, resource.RLIM_INFINITY)
             resource.prlimit(run.process.pid, resource.RLIMIT_FSIZE, room)
-            code, _ = run.left()
-            assert (code, stand.highest_bar()) == (0, 0.0), run.said
-            assert "15 of 15 control steps" in run.said
-            assert "missed ticks: 0" in run.said
-            assert re.search(r"log: \d+ log lines lost \(File too large\)", run.said), run.said
+            code, _ = run.wait_exit()
+            assert (code, stand.highest_bar()) == (0, 0.0), run.output
+            assert "15 of 15 control steps" in run.output
+            assert "missed ticks: 0" in run.output
+            assert re.search(r"log: \d+ log lines lost \(File too large\)", run.output), run.output
             assert len(run.log().ticks) < 15
-            return float(re.search(r"tick lateness: .*largest ([\d.]+) ms", run.said)[1])
+            return float(re.search(r"tick lateness: .*largest ([\d.]+) ms", run.output)[1])
 
     worst_ms = max(side_by_side(len(phases_s), attempt, 3))
     matrix_row(
@@ -203,16 +203,16 @@ def stepping(tmp_path_factory):
 def test_row_27_wall_clock_steps(matrix_row, full, model_file, tmp_path, stepping):
     tries, steps = 10 if full else 2, 25 if full else 15
 
-    @if_begun
+    @retry_until_begun
     def attempt(number, again=2):
         """Every run but the first has a wall clock that steps."""
         folder, how = tmp_path / f"{number}-{again}", {"env": stepping} if number else {}
         with Stand() as stand, Run(stand, model_file, folder, "--steps", str(steps), **how) as run:
-            code, _ = run.left()
+            code, _ = run.wait_exit()
         log = run.log()
         if again and (code, len(log.ticks)) != (0, steps):
             return attempt(number, again - 1)  # a starved host misses ticks, and then its commands are others
-        assert code == 0, run.said
+        assert code == 0, run.output
         walls = [datetime.fromisoformat(record.wall).timestamp() for record in log.ticks]
         stepped = sum(abs(b - a - PERIOD_S) > 60 for a, b in itertools.pairwise(walls))
         assert (stepped > steps / 2) == (number > 0)

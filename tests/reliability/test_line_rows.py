@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from mega_in_run import side_by_side
-from runtime_in_run import Run, Stand, if_begun
+from runtime_in_run import Run, Stand, retry_until_begun
 
 pytestmark = pytest.mark.realtime
 
@@ -16,7 +16,7 @@ LIMIT_S = 3 * 0.4 + 0.05
 # a period later than with a tracker that fails at once: 1.56 s was seen.
 LATER_LIMITS_S = {"frames 1 s old": LIMIT_S + 0.4}
 LATE_HOST_MS = 5.0
-# The fault, its row, the exit code, and what is said of it.
+# The fault, its row, the exit code, and the pattern of its message.
 FAULTS = {
     "unplugged": ({"unplug": True}, 13, 74, "tracker"),
     "mute": ({"mute": True}, 13, 74, "no new frame"),
@@ -35,7 +35,7 @@ def test_rows_13_14_15_18_19_tracker_in_trouble_on_the_line(matrix_row, full, mo
     attempts = [name for name in FAULTS for _ in range(tries)]
     phases_s = np.random.default_rng(13).uniform(0.0, 0.4, len(attempts))
 
-    @if_begun
+    @retry_until_begun
     def attempt(number, again=2):
         name = attempts[number]
         fault, _, code, word = FAULTS[name]
@@ -44,8 +44,8 @@ def test_rows_13_14_15_18_19_tracker_in_trouble_on_the_line(matrix_row, full, mo
             time.sleep(phases_s[number])
             began_ns = time.monotonic_ns()
             stand.tracker.send(fault)
-            assert run.left()[0] == code, run.said
-            assert word in run.said
+            assert run.wait_exit()[0] == code, run.output
+            assert word in run.output
             assert stand.highest_bar() == 0.0
             log = run.log()
             assert log.meta["vented"]
@@ -64,7 +64,7 @@ def test_rows_13_14_15_18_19_tracker_in_trouble_on_the_line(matrix_row, full, mo
     late = []
     for name, (_, row, _, _) in FAULTS.items():
         limit_s = LATER_LIMITS_S.get(name, LIMIT_S)
-        worst_s = max(took for told, took in zip(attempts, took_s, strict=True) if told == name)
+        worst_s = max(took for attempted, took in zip(attempts, took_s, strict=True) if attempted == name)
         matrix_row(
             row,
             fault=f"{name}, on the line",
@@ -87,7 +87,7 @@ def test_row_18_one_bad_moment_is_waited_out_on_the_line(matrix_row, model_file,
             stand.tracker.send({"hide": []})
             run.wait_for(lambda before=before: run.ticks() >= before + 3, 5)
         run.process.send_signal(signal.SIGINT)
-        assert run.left()[0] == 130, run.said
+        assert run.wait_exit()[0] == 130, run.output
         log = run.log()
     held = [record for record in log.ticks if record.frame_status != "good"]
     assert 3 <= len(held) <= 6

@@ -63,9 +63,9 @@ def test_row_26_one_core_with_four_busy_processes(matrix_row, full, strong_model
     with Stand() as stand, Run(stand, strong_model, tmp_path, "--steps", str(steps), **pinned) as run:
         run.wait_for(lambda: run.ticks() >= 1)
         code = run.process.wait(steps * PERIOD_S + 30.0)
-        run.left()
+        run.wait_exit()
         log = run.log()
-        assert code in (0, *GAVE_UP), run.said
+        assert code in (0, *GAVE_UP), run.output
         assert stand.highest_bar() == 0.0
     gap_s = never_a_burst(log)
     late_ms = np.array([tick.late_ms for tick in log.ticks])
@@ -108,7 +108,7 @@ def goes_on(run):
     """Whether it ticks on; False when it ended."""
     before, until_s = run.ticks(), time.monotonic() + 15.0
     while run.process.poll() is None and run.ticks() < before + 4:
-        assert time.monotonic() < until_s, run.said
+        assert time.monotonic() < until_s, run.output
         time.sleep(0.05)
     return run.process.poll() is None
 
@@ -125,14 +125,14 @@ def test_row_26_halted_for_50_to_600_ms(matrix_row, full, strong_model, tmp_path
             went_on = goes_on(run)
             if went_on:
                 run.process.send_signal(signal.SIGINT)
-            code, _ = run.left()
+            code, _ = run.wait_exit()
             log, events = run.log(), list(stand.board.trace)
-            assert code == 130 if went_on else code in GAVE_UP, run.said
+            assert code == 130 if went_on else code in GAVE_UP, run.output
             assert stand.highest_bar() == 0.0
             assert log.meta["exit_code"] == code
             gap_s = never_a_burst(log)
             if halt_s < SURELY_OUTLASTED_S:
-                assert went_on, run.said
+                assert went_on, run.output
             if halt_s > SURELY_TOO_LONG_S:
                 assert not went_on, "the board cannot have heard anything for too long"
             vented_ms = None

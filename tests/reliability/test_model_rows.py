@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from corrupted_models import corrupted, with_description_changed, with_fault_above
 from mega_in_run import side_by_side
-from runtime_in_run import SCRIPT, Run, Stand, if_begun
+from runtime_in_run import SCRIPT, Run, Stand, retry_until_begun
 from virtual_loop import World
 
 from modsoft.hil.board.emulator import EmulatedBoard
@@ -58,9 +58,9 @@ def test_row_20_damaged_model_file(matrix_row, full, model_file, tmp_path):
     with EmulatedBoard() as board:
         for _ in range(tries):
             path.write_bytes(corrupted(valid, generator))
-            said, took_s = refusal(path, board.port, tmp_path / "runs")
-            assert str(path) in said
-            assert "\n" not in said
+            message, took_s = refusal(path, board.port, tmp_path / "runs")
+            assert str(path) in message
+            assert "\n" not in message
             worst_s = max(worst_s, took_s)
         assert untouched(board)
     assert not (tmp_path / "runs").exists()
@@ -126,13 +126,13 @@ def test_row_21_model_of_another_robot(matrix_row, make_checkpoint, model_file, 
     with EmulatedBoard() as board:
         for name, (change, found, expected) in OTHERS.items():
             model = with_description_changed(model_file, tmp_path / "model.onnx", change)
-            said, _ = refusal(model, board.port, tmp_path / "runs")
-            assert found in said, name
-            assert expected in said, name
+            message, _ = refusal(model, board.port, tmp_path / "runs")
+            assert found in message, name
+            assert expected in message, name
         cable = export(make_checkpoint(tmp_path / "cable.pt", "cable-4")).path
-        said, _ = refusal(cable, board.port, tmp_path / "runs")
-        assert "trained for kind cable, state size 3, action size 2, period_s 1.0" in said
-        assert "has kind pneumatic, state size 2, action size 1, period_s 0.4" in said
+        message, _ = refusal(cable, board.port, tmp_path / "runs")
+        assert "trained for kind cable, state size 3, action size 2, period_s 1.0" in message
+        assert "has kind pneumatic, state size 2, action size 1, period_s 0.4" in message
         assert untouched(board)
     matrix_row(
         21,
@@ -147,9 +147,11 @@ def test_row_22_model_gives_nan(matrix_row, full):
     rng, tries = np.random.default_rng(22), 10_000 if full else 300
     for _ in range(tries):
         world, step = World(steps=12), rng.integers(1, 12)
-        spoilt = np.full((3, 1), 0.1)
-        spoilt[rng.integers(3), 0] = rng.choice(WILD)
-        world.answer = lambda features, w=world, s=step, a=spoilt: a if len(w.features) == s else np.full((3, 1), 0.1)
+        corrupted_actuation = np.full((3, 1), 0.1)
+        corrupted_actuation[rng.integers(3), 0] = rng.choice(WILD)
+        world.answer = lambda features, w=world, s=step, a=corrupted_actuation: (
+            a if len(w.features) == s else np.full((3, 1), 0.1)
+        )
         with pytest.raises(ModelError, match="nothing of it was sent"):
             world.run()
         assert len(world.sent) == step  # actuation 0 and the steps before
@@ -169,14 +171,14 @@ def test_row_22_model_gives_nan_on_the_board(matrix_row, full, model_file, tmp_p
     """A model that passes every check, and goes wild in mid-run."""
     values = WILD * 5 if full else WILD[:4]
 
-    @if_begun
+    @retry_until_begun
     def attempt(number):
         folder = Path(tmp_path / str(number))
         folder.mkdir(exist_ok=True)
         model = with_fault_above(model_file, folder / "model.onnx", values[number], threshold=0.2)
         with Stand() as stand, Run(stand, model, folder) as run:
-            assert run.left()[0] == 65, run.said
-            assert "the actuation is not finite" in run.said or "nothing of it was sent" in run.said
+            assert run.wait_exit()[0] == 65, run.output
+            assert "the actuation is not finite" in run.output or "nothing of it was sent" in run.output
             assert stand.highest_bar() == 0.0
             log = run.log()
         assert len(log.ticks) >= 4

@@ -95,14 +95,14 @@ def test_row_07_the_next_run_finds_the_board_by_its_serial_number(matrix_row, mo
         with Run(stand, model_file, tmp_path / "first") as run:
             run.wait_for(lambda: run.ticks() >= 2)
             inject(stand.board, "unplug")
-            assert run.left()[0] == 74, run.said
+            assert run.wait_exit()[0] == 74, run.output
         _, since = inject(stand.board, f"plug {new_name}")
         with Run(stand, model_file, tmp_path / "second", program=program) as run:
             assert run.process.wait(30) == 69
-        assert f"found an Arduino MEGA at {new_name}; give its serial number, --port {number}" in run.said
+        assert f"found an Arduino MEGA at {new_name}; give its serial number, --port {number}" in run.output
         assert not [event for event in stand.board.trace[since:] if event["event"] == "uart-open"], "nothing opened"
         with Run(stand, model_file, tmp_path / "third", "--port", number, "--steps", "3", program=program) as run:
-            assert run.left()[0] == 0, run.said
+            assert run.wait_exit()[0] == 0, run.output
         assert run.log().meta["port"] == new_name
     matrix_row(
         7,
@@ -213,7 +213,9 @@ def test_row_24_port_busy_message_of_modsoft_runtime(matrix_row, model_file, tmp
     with Stand() as stand, contextlib.closing(ports.open_port(stand.board.port, 250000)):
         with Run(stand, model_file, tmp_path) as run:
             assert run.process.wait(30) == 75
-        assert run.said.splitlines()[-1].startswith(f"modsoft-runtime: {stand.board.port} is in use by another program")
+        assert run.output.splitlines()[-1].startswith(
+            f"modsoft-runtime: {stand.board.port} is in use by another program"
+        )
         assert not run.armed()
         assert stand.highest_bar() == 0.0
     matrix_row(24, fault="port busy, modsoft-runtime", tries=1, limit="exit 75, one line", worst="as required")

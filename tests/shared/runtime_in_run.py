@@ -21,7 +21,7 @@ from modsoft.runtime.log_reader import Follower, read
 SCRIPT = Path(sys.executable).with_name("modsoft-runtime")
 FAULTY = (sys.executable, str(Path(__file__).with_name("faulty_runtime.py")))
 BEGIN_S = 30.0  # until the first tick, on a busy machine
-LEAVE_S = 40.0  # a lost board is listened to for 6 s, and a short task is waited for
+LEAVE_S = 40.0  # the runtime waits 6 s for a lost board; a short task runs to its end
 
 
 # Makes standard input the terminal of a new session, as a terminal's window does, and becomes the program.
@@ -33,28 +33,27 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 
 class NeverBegan(AssertionError):
-    """modsoft-runtime did not get as far as arming. A machine that is busy enough does not give the emulated board its
-    time to announce itself."""
+    """modsoft-runtime did not reach arming: on a busy machine the emulated board may start too late."""
 
 
-def if_begun(attempt, again=4):
-    """`attempt`, made again where its run never began: there is then nothing to judge."""
+def retry_until_begun(attempt, again=4):
+    """`attempt`, repeated while its run never began."""
 
-    def made(*told):
+    def repeated(*arguments):
         for left in reversed(range(again)):
             try:
-                return attempt(*told)
+                return attempt(*arguments)
             except NeverBegan:
                 if not left:
                     raise
 
-    return made
+    return repeated
 
 
 class Stand:
-    """Context manager: a board, a tracker that sees a robot hanging still, and nothing that moves it.
+    """Context manager: a board, and a tracker that sees a robot at rest.
 
-    Far cheaper than the rig, which simulates the robot: several of them run side by side.
+    Needs far less of a core than the rig, which simulates the robot: several of them run side by side.
     """
 
     def __init__(self, board="auto", angles_deg=(1.0, 2.0, -3.0)):
@@ -76,28 +75,30 @@ class Stand:
             self._exits = exits.pop_all()
         return self
 
-    def __exit__(self, *told):
+    def __exit__(self, *error):
         self._exits.close()
 
     def highest_bar(self):
-        """What the valves are told now, at the most."""
+        """Highest valve output now, bar."""
         return max(self.board.duties(), default=0.0) * self.board.ready["p_full_bar"]
 
     def options(self):
-        """What modsoft-runtime has to be told to run on these."""
+        """Options of modsoft-runtime for this board and tracker."""
         tools = [option for path in self.tool_files for option in ("--tool", str(path))]
         ports = ["--port", self.board.port, "--tracker-port", self.tracker_port]
         return ["--yes", "--robot", "pneumatic-3", *ports, *tools]
 
 
 class Run:
-    """Context manager: modsoft-runtime on a stand, killed at the end if need be.
+    """Context manager: modsoft-runtime on a stand; killed at the end if it still runs.
 
-    program: what is started; a wrapper of it such as `FAULTY` for faults in the process itself.
+    program: the command; `FAULTY` for faults in the process itself.
     """
 
-    def __init__(self, stand, model, folder, *options, task="down", program=(str(SCRIPT),), terminal=None, **how):
-        """`terminal`: a file descriptor of what is to be its terminal, where it then says what it has to say."""
+    def __init__(
+        self, stand, model, folder, *options, task="down", program=(str(SCRIPT),), terminal=None, **options_of_popen
+    ):
+        """terminal: file descriptor of its terminal, which then receives its output."""
         self.stand, self.runs = stand, folder / "runs"
         self.began = len(stand.board.trace)
         self._follower = None
@@ -112,20 +113,20 @@ class Run:
             stdin=subprocess.DEVNULL if terminal is None else terminal,
             stdout=subprocess.DEVNULL if terminal is None else terminal,
             stderr=subprocess.PIPE if terminal is None else terminal,
-            **how,
+            **options_of_popen,
         )
-        self.words = []  # (CLOCK_MONOTONIC ns, line)
+        self.lines = []  # (CLOCK_MONOTONIC ns, line)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self):
         for line in self.process.stderr or ():
-            self.words.append((time.monotonic_ns(), line.rstrip("\n")))
+            self.lines.append((time.monotonic_ns(), line.rstrip("\n")))
 
     def __enter__(self):
         return self
 
-    def __exit__(self, *told):
+    def __exit__(self, *error):
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGCONT)
             self.process.kill()
@@ -135,14 +136,14 @@ class Run:
             self.process.stderr.close()
 
     @property
-    def said(self):
-        return "\n".join(line for _, line in self.words)
+    def output(self):
+        return "\n".join(line for _, line in self.lines)
 
     def wait_for(self, condition, timeout_s=BEGIN_S):
         until_s = time.monotonic() + timeout_s
         while not condition():
             if self.process.poll() is not None or time.monotonic() > until_s:
-                raise AssertionError(self.said) if self.armed() else NeverBegan(self.said)
+                raise AssertionError(self.output) if self.armed() else NeverBegan(self.output)
             time.sleep(0.02)
 
     def last_tick(self):
@@ -160,15 +161,15 @@ class Run:
     def ticks(self):
         return self._follower.count if self.armed() and self.last_tick() else 0
 
-    def left(self):
-        """The exit code and when the process was seen to be gone, CLOCK_MONOTONIC ns; the stand then knows all that the
-        board did until its port was closed. Its events come some time after the process has ended."""
-        code, left_ns = self.process.wait(LEAVE_S), time.monotonic_ns()
+    def wait_exit(self):
+        """Waits for the end of the process and for the board's last event, which comes later; returns the exit code
+        and the time of the exit, CLOCK_MONOTONIC ns."""
+        code, exited_ns = self.process.wait(LEAVE_S), time.monotonic_ns()
         self._reader.join()
         if not self.armed():
-            raise NeverBegan(self.said)
+            raise NeverBegan(self.output)
         self.stand.board.wait_for(is_event("uart-close"), 5.0, since=self.began)
-        return code, left_ns
+        return code, exited_ns
 
     def log(self):
         [folder] = self.runs.iterdir()

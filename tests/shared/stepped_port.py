@@ -26,11 +26,11 @@ class SteppedPort:
         self.written: list[tuple[float, bytes]] = []  # (clock, bytes)
         self._board = board
         self._port = serial.Serial(name or board.port, baud, timeout=0, exclusive=True)
-        self._from_host, self._taken = board.ran["from_host"], board.ran["to_host"]
+        self._from_host, self._taken = board.last_run["from_host"], board.last_run["to_host"]
 
     def clock(self) -> float:
         """Emulated seconds."""
-        return float(self._board.ran["t_us"]) * 1e-6
+        return float(self._board.last_run["t_us"]) * 1e-6
 
     def idle(self, seconds: float) -> None:
         """Let time pass without reading."""

@@ -27,14 +27,14 @@ STEPS = 40
 
 
 class SteppedRun:
-    """`cause(run)` is called `cause_s` after the beginning of arming. After `go`: `error`, what the run raised in the
-    end, and `said`, (emulated seconds, highest duty at that instant, line) of all that it said."""
+    """`cause(run)` is called `cause_s` after the beginning of arming. After `go`: `error`, the exception
+    of the run, and `messages`, (emulated seconds, highest duty at that time, line) of all its messages."""
 
     history = 3  # of the model
 
     def __init__(self, emulated, folder, cause, cause_s):
         self.emulated, self.cause, self.cause_s = emulated, cause, cause_s
-        self.said, self.left, self.error, self.caused_s = [], [], None, math.inf
+        self.messages, self.forced_exits, self.error, self.caused_s = [], [], None, math.inf
         self.port = SteppedPort(emulated)
         self.clock = self.port.clock
         self.board = Board(self.port, "the emulated MEGA", self.clock, threaded=False)
@@ -66,7 +66,7 @@ class SteppedRun:
         return np.ones((ROBOT.modules, 1))
 
     def say(self, text):
-        self.said.append((self.clock(), max(self.emulated.duties()), text))
+        self.messages.append((self.clock(), max(self.emulated.duties()), text))
 
     def go(self):
         """Arms, runs, vents and closes."""
@@ -74,7 +74,7 @@ class SteppedRun:
         say, session._say = session._say, self.say
         error = None
         try:
-            with Signals(self.stop, self.left.append) as signals:
+            with Signals(self.stop, self.forced_exits.append) as signals:
                 signals.hold()
                 try:
                     self.board.arm(ROBOT)

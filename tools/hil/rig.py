@@ -3,9 +3,9 @@
     board (valve duties) -> plant -> poses -> tracker -> modsoft-runtime -> set-points -> board
                                   -> chamber pressures -> the board's analogue inputs
 
-Each is a process of its own; this one only passes lines on, and keeps them: `board.jsonl` every event of the board with
-the timer registers, `plant.jsonl` where the robot really was. However the rig is left, all of them are ended; if it is
-killed they see the end of their input, and the runtime loses its board and ends by itself.
+Each is a process. The rig forwards lines between them and writes them: `board.jsonl` has the events of the
+board with the timer registers, `plant.jsonl` the states of the simulated robot. All processes end with the rig; if it
+is killed they see the end of their input, and the runtime loses its board and ends.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from modsoft.runtime.log_reader import Follower
 Line = dict[str, Any]
 
 START_TIMEOUT_S = 60.0  # the first start compiles the simulator
-RUNTIME_STOP_TIMEOUT_S = 5.0  # it vents and waits for the board's word
+RUNTIME_STOP_TIMEOUT_S = 5.0  # it vents and waits for the board's confirmation
 FORWARD_PERIOD_S = 0.004  # a slewing board changes its duties every millisecond; the plant needs them every 20
 SENSED_CHANNELS = 8  # A0 to A7
 
@@ -63,30 +63,30 @@ class Child:
         self._reader.start()
 
     def wait_ready(self, timeout_s: float = START_TIMEOUT_S) -> None:
-        """Returns when the process said `ready`; `DeviceAbsent` with its last word when it ended instead."""
+        """Returns when the process reports `ready`; `DeviceAbsent` with its last message when it ended."""
         deadline = time.monotonic() + timeout_s
         while not self._ready.wait(0.1):
             if self.process.poll() is not None or time.monotonic() > deadline:
-                raise DeviceAbsent(f"the {self.name} did not start: {self.last_word()}")
+                raise DeviceAbsent(f"the {self.name} did not start: {self.last_message()}")
 
     def send(self, line: Line) -> None:
-        """One line to the process. One that has ended is noticed by `check`, not here."""
+        """Sends one line to the process; `check` finds out whether it has ended."""
         with contextlib.suppress(BrokenPipeError, ValueError), self._sending:
             self._input.write(json.dumps(line).encode() + b"\n")
             self._input.flush()
 
     def check(self) -> None:
-        """`LostInRun` when the process ended by itself."""
+        """`LostInRun` if the process ended by itself."""
         if self._ended and self.process.poll() is not None:
-            raise LostInRun(f"the {self.name} ended in mid-run: {self.last_word()}")
+            raise LostInRun(f"the {self.name} ended in mid-run: {self.last_message()}")
 
-    def last_word(self) -> str:
+    def last_message(self) -> str:
         self._stderr.seek(0)
         lines = self._stderr.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else f"exit code {self.process.poll()}"
 
     def stop(self) -> None:
-        """Ends the process: at the end of its input, or else by force. Twice does no harm."""
+        """Ends the process by the end of its input, or by force. May be called twice."""
         end(self.process, self._sending)
         self._reader.join()
         self._output.close()
@@ -106,11 +106,11 @@ class Child:
 
 
 class Rig:
-    """Context manager. Inside it the board hangs on `board.port`, the tracker on `tracker_port`, and the robot hangs
-    at rest in real time; `run` starts modsoft-runtime on them."""
+    """Context manager: the board is at `board.port`, the tracker at `tracker_port`, and the robot hangs at rest in real
+    time; `run` starts modsoft-runtime on them."""
 
     def __init__(self, robot_file: str | Path, folder: Path, board: str = "auto"):
-        """`robot_file`: file or shipped name; `folder`: where the traces and the runtime's words go."""
+        """`robot_file`: file or shipped name; `folder`: of the traces and the runtime's output."""
         self.robot = load_robot(robot_file)
         self._robot_file = str(Path(robot_file).resolve() if Path(robot_file).is_file() else robot_file)
         self.folder = folder
@@ -128,7 +128,7 @@ class Rig:
     # ---- Start and end
 
     def __enter__(self) -> Rig:
-        with self._exits as exits:  # what has been started ends even when the rest does not start
+        with self._exits as exits:  # started processes end even if another one does not start
             self.folder.mkdir(parents=True, exist_ok=True)
             self._ports = Path(exits.enter_context(tempfile.TemporaryDirectory(prefix="modsoft-rig-")))
             self._board_log = exits.enter_context((self.folder / "board.jsonl").open("w", encoding="utf-8"))
@@ -143,7 +143,7 @@ class Rig:
             exits.callback(self.tracker.stop)
             self.tracker.wait_ready()
             self.plant = Child("modsoft.hil.plant", ["--robot", self._robot_file], self._plant_state)
-            # Whoever only passes lines on may be held up by a process that hangs: the one that takes them ends first.
+            # A thread that forwards lines may be blocked by a process that hangs: the receiving process ends first.
             forwarder = threading.Thread(target=self._forward_duties, name="duties", daemon=True)
             exits.callback(lambda: forwarder.join() if forwarder.ident else None)
             exits.callback(self.plant.stop)
@@ -166,10 +166,10 @@ class Rig:
         return str(self.tracker.ready["port"])
 
     def run(self, model: str | Path, task: str, *options: str, runs: Path | None = None) -> subprocess.Popen[bytes]:
-        """Starts modsoft-runtime, unmodified, as anybody would: its console script, beside this interpreter.
+        """Starts the unmodified modsoft-runtime by its console script beside this interpreter.
 
-        Its log goes to a folder in `runs` (None: a new folder in the rig's own), what it says to runtime.out and
-        runtime.err. Further options are passed on.
+        Its log goes to a folder in `runs` (None: a new folder in the rig's own), its output to runtime.out and
+        runtime.err. options: further options of modsoft-runtime.
         """
         script = Path(sys.executable).parent / "modsoft-runtime"
         if not script.is_file():
@@ -204,8 +204,8 @@ class Rig:
         return self.runtime
 
     def wait(self, timeout_s: float, progress: Callable[[int], None] = lambda ticks: None) -> int:
-        """The runtime's exit code; `progress` is told the ticks so far twice a second. `LostInRun` when a part of the
-        rig ended first, or when the runtime takes longer than `timeout_s`."""
+        """The runtime's exit code; `progress` receives the number of ticks twice a second. `LostInRun` if a part of
+        the rig ended first, or if the runtime takes longer than `timeout_s`."""
         deadline = time.monotonic() + timeout_s
         while True:
             try:
@@ -221,12 +221,12 @@ class Rig:
                 return code
 
     def settle(self, seconds: float) -> None:
-        """Goes on without the runtime for so long, so that the traces show what became of the robot."""
+        """Continues without the runtime for this time, so that the traces show the robot afterwards."""
         time.sleep(seconds)
         self.plant.check()
 
     def run_folder(self) -> Path | None:
-        """Where the runtime logs, as soon as it does."""
+        """Folder of the runtime's log; None before it exists."""
         found = sorted(self.runs.glob("*/run.jsonl")) if self.runs else []
         return found[-1].parent if found else None
 
@@ -245,7 +245,7 @@ class Rig:
         lines = (self.folder / "runtime.err").read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
 
-    # ---- Lines passed on
+    # ---- Forwarded lines
 
     def _board_event(self, event: Line) -> None:
         _write(self._board_log, event)
@@ -270,7 +270,7 @@ class Rig:
 
 
 def _stop_runtime(process: subprocess.Popen[bytes]) -> None:
-    """As Ctrl-C would: it vents, closes its log and ends. By force where it does not."""
+    """Ends the runtime as Ctrl-C does: it vents and closes its log; by force if it does not end."""
     if process.poll() is not None:
         return
     process.send_signal(signal.SIGINT)

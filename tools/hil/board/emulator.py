@@ -1,4 +1,4 @@
-"""Builds, starts and talks to the emulated board.
+"""Builds and starts the emulated board, and communicates with it.
 
 Two boards with one interface: `simavr` runs the compiled firmware on an emulated ATmega2560 behind the MEGA's real
 bootloader; `native` runs the firmware's logic compiled for this machine, for machines without simavr, and shows no
@@ -106,7 +106,7 @@ def build(board: BoardName, *, firmware: bool = True) -> Path:
     folder = BUILD / "hil"
     folder.mkdir(parents=True, exist_ok=True)
     program = folder / f"{board}_board"
-    with (folder / f"{board}.lock").open("w") as lock:  # several test runs may want it at once
+    with (folder / f"{board}.lock").open("w") as lock:  # several test runs may build at once
         fcntl.flock(lock, fcntl.LOCK_EX)
         if board == "simavr" and firmware:
             out = os.path.relpath(FIRMWARE_ELF.parent, FIRMWARE)
@@ -134,14 +134,14 @@ def is_event(name: str, **values: Any) -> Callable[[Event], bool]:
 
 
 def end(process: subprocess.Popen[bytes], sending: threading.Lock) -> None:
-    """End a process by the end of its input, or by force. `sending` is held by whoever writes to it.
+    """End a process by the end of its input, or by force. `sending` is the lock of its writers.
 
-    One that hangs with a full pipe blocks its writer, who keeps the lock: that one is killed without it.
+    A process that hangs with a full pipe blocks its writer, which keeps the lock: it is killed without the lock.
     """
     assert process.stdin is not None
     if sending.acquire(timeout=STOP_TIMEOUT_S):
         try:
-            with contextlib.suppress(BrokenPipeError):  # of what was not written yet
+            with contextlib.suppress(BrokenPipeError):  # of unwritten data
                 process.stdin.close()
         finally:
             sending.release()
@@ -159,7 +159,7 @@ class EmulatedBoard:
 
     Every event is kept in `trace` (dicts with at least `event`, `t_us` in emulated microseconds, `mono_ns` in
     CLOCK_MONOTONIC nanoseconds); `on_event`, if given, is called for each from the reading thread and must be quick.
-    Ends when the context does, and when this process dies in whatever way: the board sees the end of its input.
+    Ends with the context, and when this process dies: the board sees the end of its input.
     """
 
     def __init__(
@@ -179,8 +179,8 @@ class EmulatedBoard:
         bootloader: run behind the MEGA's real bootloader, as a board from the shop does. simavr only.
         port_link: where the link to the serial port goes; a temporary folder where it is None.
         fast: run as fast as it can. The board's time-outs then fire early for a host in real time: only emulated
-        times (`t_us`) are worth anything.
-        stepped: its time stands still but for `run`; tests/shared/stepped_port.py is a serial port for it.
+        times (`t_us`) are meaningful.
+        stepped: its time advances only in `run`; tests/shared/stepped_port.py is a serial port for it.
         """
         self.board = choose(board)
         self._firmware = firmware
@@ -196,17 +196,17 @@ class EmulatedBoard:
         self._duties: list[float] = []
         self.trace: list[Event] = []
         self.ready: Event = {}
-        self.ran: Event = {"t_us": 0.0, "from_host": 0, "to_host": 0}  # the last `run`; stepped only
+        self.last_run: Event = {"t_us": 0.0, "from_host": 0, "to_host": 0}  # the last `run`; stepped only
         self.summary: Event = {}
 
     @property
     def port(self) -> str:
-        """The path to give to the host as its serial port. It is not there while unplugged."""
+        """Path of the serial port for the host; missing while unplugged."""
         return str(self._link)
 
     @property
     def clock(self) -> str:
-        """In which clock the board's time-outs ran, for the report."""
+        """Clock of the board's time-outs, for the report."""
         return str(self.ready["clock"])
 
     @property
@@ -215,7 +215,7 @@ class EmulatedBoard:
         return int(self.ready["pid"])
 
     def start(self) -> EmulatedBoard:
-        """Build what is missing and start; return when the serial port is there. `DeviceAbsent` where it cannot."""
+        """Build what is missing and start; return when the serial port exists. `DeviceAbsent` where it cannot."""
         program = build(self.board, firmware=self._firmware is None)
         command = [str(program), "--port-link", str(self._link)]
         if self.board == "simavr":
@@ -225,7 +225,7 @@ class EmulatedBoard:
         self._stderr = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, start_new_session=True
-        )  # a Ctrl-C at the terminal is for the host; the board goes when it is told to
+        )  # a Ctrl-C at the terminal is for the host; `stop` ends the board
         self._reader = threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True)
         self._reader.start()
         try:
@@ -236,7 +236,7 @@ class EmulatedBoard:
         return self
 
     def send(self, command: str) -> None:
-        """Give the board one command; see the top of board.c. `DeviceAbsent` if it is gone."""
+        """Send the board one command; see the top of board.c. `DeviceAbsent` if it has ended."""
         process = self._process
         if process is None or process.stdin is None:
             raise DeviceAbsent(f"the {self.board} board is not running")
@@ -248,11 +248,11 @@ class EmulatedBoard:
             raise DeviceAbsent(f"the {self.board} board has ended") from None
 
     def run(self, microseconds: int, from_host: int) -> Event:
-        """Stepped: let so much time pass, as soon as so many bytes in all came from the host."""
+        """Stepped: let this time pass, as soon as `from_host` bytes in total have arrived from the host."""
         since = len(self.trace)
         self.send(f"run {microseconds} {from_host}")
-        self.ran = self.wait_for(is_event("ran"), RUN_TIMEOUT_S, since)
-        return self.ran
+        self.last_run = self.wait_for(is_event("ran"), RUN_TIMEOUT_S, since)
+        return self.last_run
 
     def duties(self) -> list[float]:
         """The effective duty of each channel now, 0 to 1, in the order of firmware/pins.h."""
@@ -260,13 +260,13 @@ class EmulatedBoard:
             return list(self._duties)
 
     def millivolt(self, pressure_bar: float) -> int:
-        """What a sensor on this board shows at a pressure, for `adc`."""
+        """Voltage of a sensor on this board at a pressure, for the command `adc`."""
         return round(pressure_bar * float(self.ready["sensor_mv_per_bar"]))
 
     def wait_for(self, predicate: Callable[[Event], bool], timeout_s: float, since: int = 0) -> Event:
         """Return the first event in `trace[since:]` that the predicate accepts; `TimeoutError` if none comes.
 
-        Take `since = len(board.trace)` before the cause, so that an effect from before is not taken for the answer.
+        Take `since = len(board.trace)` before the cause, to exclude earlier events.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
@@ -286,7 +286,7 @@ class EmulatedBoard:
         process, self._process = self._process, None
         if process is None or process.stdin is None or process.stdout is None:
             return self.summary
-        end(process, self._sending)  # end of file: the same way as when this process dies
+        end(process, self._sending)  # end of file, as when this process dies
         self._reader.join()
         process.stdout.close()
         self._stderr.seek(0)
