@@ -73,15 +73,15 @@ def test_row_12_every_exit_path_vents(matrix_row, full, model_file, tmp_path):
                 time.sleep(BOARD_ALONE_S)
             assert stand.highest_bar() == 0.0, run.output
             closed_ns, log = run.closed_ns(), run.log()
-            end = log.events[-1]
-            assert (end["event"], log.meta["exit_code"], end["exit_code"]) == ("end", code, code)
-            assert end["vented"] == log.meta["vented"] == can_confirm, run.output
+            end = log.end
+            assert (log.meta["exit_code"], end.exit_code) == (code, code)
+            assert end.vented == log.meta["vented"] == can_confirm, run.output
             [reported_ns] = [at_ns for at_ns, line in run.lines if line.startswith("valves vented")]
             assert (VENTED in run.output, UNKNOWN in run.output) == (can_confirm, not can_confirm)
             assert log.meta["reason"] in run.output
             assert run.lines[-1][1].startswith("modsoft-runtime: ")
             if can_confirm:
-                assert closed_ns < end["vented_ns"] < reported_ns < exited_ns
+                assert closed_ns < end.vented_ns < reported_ns < exited_ns
             return name, (closed_ns - began_ns) * 1e-9 if closed_ns else None, (exited_ns - began_ns) * 1e-9
 
     results = side_by_side(len(attempts), attempt, AT_ONCE)
@@ -115,8 +115,8 @@ def test_row_12_vented_is_not_reported_without_the_board(matrix_row, model_file,
             assert run.wait_exit()[0] == code, run.output
             assert stand.highest_bar() == 0.0
             assert (VENTED in run.output, UNKNOWN in run.output) == (False, True)
-            end = run.log().events[-1]
-            assert (end["vented"], end["vented_ns"]) == (False, None)
+            end = run.log().end
+            assert (end.vented, end.vented_ns) == (False, None)
 
     side_by_side(len(names), attempt, AT_ONCE)
     matrix_row(
@@ -256,7 +256,7 @@ def test_row_12_the_stop_key(model_file, tmp_path, terminal):
         output = os.read(terminal["master"], 65536).decode(errors="replace")
         assert (code, VENTED in output, "stop key" in output) == (79, True, True), output
         assert stand.highest_bar() == 0.0
-        assert run.closed_ns() < run.log().events[-1]["vented_ns"] < exited_ns
+        assert run.closed_ns() < run.log().end.vented_ns < exited_ns
 
 
 def test_row_12_the_terminal_is_closed(model_file, tmp_path, terminal):
@@ -268,4 +268,4 @@ def test_row_12_the_terminal_is_closed(model_file, tmp_path, terminal):
         assert run.wait_exit()[0] == 129
         assert stand.highest_bar() == 0.0
         assert (run.log().meta["exit_code"], run.log().meta["vented"]) == (129, True)
-        assert run.closed_ns() < run.log().events[-1]["vented_ns"]
+        assert run.closed_ns() < run.log().end.vented_ns
