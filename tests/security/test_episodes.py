@@ -173,7 +173,7 @@ def test_second_collection_of_a_data_set_is_refused(tmp_path, parts):
 )
 def test_wrong_options_make_no_file_and_show_no_bar(tmp_path, backend, option):
     pytest.importorskip({"local": "numpy", "submitit": "submitit", "dask": "dask_jobqueue"}[backend])
-    found = subprocess.run(
+    done = subprocess.run(
         [
             sys.executable,
             "-m",
@@ -191,5 +191,5 @@ def test_wrong_options_make_no_file_and_show_no_bar(tmp_path, backend, option):
         text=True,
         check=False,
     )
-    assert (found.returncode in (2, 69), len(found.stderr.splitlines())) == (True, 1), found.stderr
+    assert (done.returncode in (2, 69), len(done.stderr.splitlines())) == (True, 1), done.stderr
     assert not list(tmp_path.iterdir())
