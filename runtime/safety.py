@@ -78,7 +78,7 @@ class FrameValidator:
         word, detail, configuration = self._order(frame, age_s)
         if word == GOOD:
             word, detail, configuration = self.content(frame)
-        if word == GOOD and configuration is not None:
+        if configuration is not None:
             word, detail = self._continuity(frame, configuration)
         else:
             self._jumped.clear()

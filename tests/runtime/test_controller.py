@@ -5,6 +5,7 @@ import pytest
 
 from modsoft.runtime import robot as robots
 from modsoft.runtime.control.controller import Controller
+from modsoft.runtime.control.correction import NoCorrection
 from modsoft.runtime.control.features import Window, from_angles_deg, state_of
 from modsoft.runtime.errors import ModelError
 
@@ -18,7 +19,7 @@ NEXT = from_angles_deg(np.array([5.0, 10.0, -20.0]))
 class Policy:
     """Returns a constant output and stores the features."""
 
-    history = 3
+    history = 4
 
     def __init__(self, output):
         self.output, self.features = np.asarray(output, dtype=float).reshape(3, 1), []
@@ -36,13 +37,30 @@ def test_step_uses_the_next_desired_configuration_and_limits_the_output():
     np.testing.assert_array_equal(actuation, [[0.5], [0.8], [-0.8]])
     np.testing.assert_array_equal(controller.target, NEXT)
     np.testing.assert_array_equal(controller.raw, policy.output)
-    window = Window(3, state_of(REST, "pneumatic"), 1)
+    window = Window(4, state_of(REST, "pneumatic"), 1)
     window.observe(state_of(measured, "pneumatic"))
     np.testing.assert_array_equal(policy.features[0], window.features(state_of(NEXT, "pneumatic")))
     np.testing.assert_array_equal(controller.applied, np.zeros((3, 1)))  # until it is recorded
     controller.record(actuation)
     np.testing.assert_array_equal(controller.applied, actuation)
     assert controller.target is controller.raw is None
+
+
+def test_nothing_is_computed_before_the_first_step():
+    controller = Controller(ROBOT, Policy([0.1, 0.2, 0.3]), REST)
+    assert controller.target is controller.raw is None
+
+
+def test_correction_gets_the_output_before_and_after_the_limits():
+    outputs = []
+
+    class Recording(NoCorrection):
+        def record_output(self, raw, applied):
+            outputs.append((raw, applied))
+
+    policy = Policy([0.5, 1.5, -1.5])
+    Controller(ROBOT, policy, REST, Recording()).compute(REST, REST, NEXT)
+    np.testing.assert_array_equal(outputs, [(policy.output, [[0.5], [0.8], [-0.8]])])
 
 
 @pytest.mark.parametrize("cause", ["no valid frame", "skipped"])
@@ -58,7 +76,7 @@ def test_state_and_actuation_are_held_without_a_measurement(cause):
     assert len(policy.features) == 1
     np.testing.assert_array_equal(controller.applied, policy.output)
     controller.compute(REST, REST, NEXT)
-    window = Window(3, state_of(REST, "pneumatic"), 1)
+    window = Window(4, state_of(REST, "pneumatic"), 1)
     for _ in range(2):
         window.observe(state_of(first, "pneumatic"))
         window.applied(policy.output)
