@@ -24,7 +24,7 @@ from pathlib import Path
 import click
 
 from modsoft.hil import shipped
-from modsoft.hil.board.emulator import build, choose
+from modsoft.hil.board.toolchain import build, choose
 from modsoft.hil.post_fault_checks import InjectedFault, SoakRun
 from modsoft.hil.record import board_description, firmware_sha256
 from modsoft.hil.soak import Soak, SoakRig

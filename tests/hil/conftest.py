@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from modsoft.hil.board import emulator
+from modsoft.hil.board import toolchain
 from modsoft.hil.board.emulator import EmulatedBoard
 
 HERE = Path(__file__).parent
@@ -25,7 +25,7 @@ TIMEOUT_S = 5.0
 @pytest.fixture(scope="session")
 def simavr() -> None:
     """For a test that needs simavr; without it, skipped."""
-    if missing := emulator.missing_packages("simavr"):
+    if missing := toolchain.missing_packages("simavr"):
         pytest.skip(f"simavr needs Debian packages: {' '.join(missing)}")
 
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
-from modsoft.hil.board import emulator
-from modsoft.hil.board.emulator import FIRMWARE, FIRMWARE_ELF, EmulatedBoard, is_event
+from modsoft.hil.board import toolchain
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.toolchain import FIRMWARE, FIRMWARE_ELF
 from modsoft.hil.outputs import read_outputs
 
 pytestmark = pytest.mark.realtime
@@ -84,7 +85,7 @@ CHECKS = [
 @pytest.fixture(scope="module")
 def firmware_copy(simavr: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the firmware and its objects, to be compiled with one change."""
-    emulator.build("simavr")
+    toolchain.build("simavr")
     folder = tmp_path_factory.mktemp("checks")
     shutil.copytree(FIRMWARE, folder / "firmware")
     shutil.copytree(FIRMWARE_ELF.parent, folder / "built")

@@ -11,29 +11,29 @@ from typing import Any
 
 import pytest
 
-from modsoft.hil.board import emulator
+from modsoft.hil.board import toolchain
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.runtime.errors import DeviceAbsent
 
 
 def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(emulator.shutil, "which", lambda name: None if name == "avr-gcc" else f"/usr/bin/{name}")
+    monkeypatch.setattr(toolchain.shutil, "which", lambda name: None if name == "avr-gcc" else f"/usr/bin/{name}")
     monkeypatch.setattr(Path, "exists", lambda self: "simavr" not in self.parts)
     with pytest.raises(DeviceAbsent, match=r"sudo apt install gcc-avr libsimavr-dev$"):
-        emulator.build("simavr")
-    assert emulator.choose("auto") == "native"
+        toolchain.build("simavr")
+    assert toolchain.choose("auto") == "native"
 
 
 def test_a_checkout_of_another_user_is_built_elsewhere() -> None:
     code = (
         "from modsoft.runtime import process\n"
         "process.is_writable = lambda folder: False\n"
-        "from modsoft.hil.board import emulator\n"
-        "print(emulator.build('native'), emulator.FIRMWARE_ELF)\n"
+        "from modsoft.hil.board import toolchain\n"
+        "print(toolchain.build('native'), toolchain.FIRMWARE_ELF)\n"
     )
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
     for path in done.stdout.split():
-        assert not Path(path).is_relative_to(emulator.ROOT)
+        assert not Path(path).is_relative_to(toolchain.ROOT)
         assert not Path(path).exists(), "it ends with its process"
 
 
@@ -42,11 +42,11 @@ def test_unknown_board_is_refused() -> None:
         EmulatedBoard("mega")
 
 
-def test_sources_compile_without_a_warning(board_name: emulator.BoardName, tmp_path: Path) -> None:
-    emulator.build(board_name, firmware=False)
-    for source in emulator._BOARD_SOURCES[board_name]:
-        flags = [flag for flag in emulator._LINK[board_name] if flag.startswith("-i")]
-        command = [*emulator._COMPILE, "-Werror", *flags, "-c", str(source), "-o", str(tmp_path / "x.o")]
+def test_sources_compile_without_a_warning(board_name: toolchain.BoardName, tmp_path: Path) -> None:
+    toolchain.build(board_name, firmware=False)
+    for source in toolchain._BOARD_SOURCES[board_name]:
+        flags = [flag for flag in toolchain._LINK[board_name] if flag.startswith("-i")]
+        command = [*toolchain._COMPILE, "-Werror", *flags, "-c", str(source), "-o", str(tmp_path / "x.o")]
         result = subprocess.run(command, capture_output=True, text=True, check=False)
         assert result.returncode == 0, result.stderr
 

@@ -5,7 +5,8 @@ from mega_in_run import stepped_host
 from output_rises import rises
 from stepped_port import SteppedPort
 
-from modsoft.hil.board.emulator import EmulatedBoard, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard
+from modsoft.hil.board.toolchain import missing_packages
 from modsoft.runtime import robot as robots
 from modsoft.runtime.board import connection
 from modsoft.runtime.board.codec import Parser, encode

@@ -15,7 +15,8 @@ import pytest
 from mega_in_run import Host, in_stepped_run, inject, side_by_side
 from output_rises import rises
 
-from modsoft.hil.board.emulator import EmulatedBoard, is_event, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.toolchain import missing_packages
 from modsoft.hil.outputs import read_outputs
 from modsoft.runtime.board.codec import Parser, encode
 from modsoft.runtime.board.protocol import (

@@ -14,7 +14,8 @@ from output_rises import rises
 from runtime_in_run import Run, Stand
 from stepped_port import SteppedPort
 
-from modsoft.hil.board.emulator import EmulatedBoard, is_event, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.toolchain import missing_packages
 from modsoft.runtime.board import connection, ports
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import PROTOCOL_HASH, State

@@ -8,7 +8,8 @@ import pytest
 from output_rises import rises
 from stepped_run import SteppedRun
 
-from modsoft.hil.board.emulator import EmulatedBoard, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard
+from modsoft.hil.board.toolchain import missing_packages
 from modsoft.hil.outputs import read_outputs
 from modsoft.runtime.errors import INTERNAL_EXIT_CODE
 

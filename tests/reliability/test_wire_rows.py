@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from frame_corruption_on_mega import FrameCorruption
 
-from modsoft.hil.board import emulator
+from modsoft.hil.board import toolchain
 from modsoft.runtime.board.protocol import State
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,7 +93,7 @@ def test_row_04_duplicated_reordered_replayed(corrupt, matrix_row, full):
     ],
 )
 def test_rows_01_to_04_on_the_emulated_board(matrix_row, full, row, kind, fault, tries, full_tries):
-    if missing := emulator.missing_packages("simavr"):
+    if missing := toolchain.missing_packages("simavr"):
         pytest.skip(f"simavr needs Debian packages: {' '.join(missing)}")
     tries = full_tries if full else tries
     with FrameCorruption() as host:

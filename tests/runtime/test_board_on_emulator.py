@@ -16,7 +16,8 @@ from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import ResetCause, VentMode
 
 pytest.importorskip("fcntl", reason="the rig needs Linux")
-from modsoft.hil.board.emulator import EmulatedBoard, choose, is_event, missing_packages
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.toolchain import choose, missing_packages
 
 pytestmark = pytest.mark.realtime
 

@@ -69,7 +69,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
         report_folder,
     )
     from modsoft.hil import report as reports
-    from modsoft.hil.board.emulator import build, choose
+    from modsoft.hil.board.toolchain import build, choose
     from modsoft.hil.plant import load_robot
     from modsoft.hil.rig import Rig
 

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.hil.board.emulator import FIRMWARE, FIRMWARE_ELF
+from modsoft.hil.board.toolchain import FIRMWARE, FIRMWARE_ELF
 from modsoft.hil.outputs import ValveOutputs, emulated_us, read_outputs
 from modsoft.runtime import log_reader
 from modsoft.runtime.arrays import Array
