@@ -94,17 +94,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
             has_log = _move_log(rig, report)
     run = record.read(report, report if has_log else None, robot, task, desired, rig.runtime.returncode)
     assessment = criteria.assess(run)
-    about = {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": f"modsoft-hil --robot {Path(robot_file).name} --model {model.name} --task {Path(task).name} "
-        f"--board {rig.board.board}" + (f" --steps {steps}" if steps else ""),
-        "board": record.board_description(rig.board.board),
-        "board's clock": rig.board.clock,
-        "firmware, SHA-256": record.firmware_sha256(rig.board.board),
-        "model, SHA-256": hashlib.sha256(model.read_bytes()).hexdigest(),
-        "robot": f"{robot.name}, {robot.modules} modules, {robot.loop.hz:g} Hz",
-        "task": f"{task}, {count} control steps",
-    }
+    about = _about(rig, robot_file, model, task, steps, count)
     if no_picture := reports.write(run, assessment, about, report):
         click.echo(f"modsoft-hil: {no_picture}", err=True)
     for line in [*assessment.criteria, *assessment.host_load_checks]:
@@ -114,6 +104,24 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     click.echo(f"{assessment}\n{report / 'report.md'}")
     # a run without a tick has no figures: its exit code is the runtime's
     return run.runtime_exit if run.runtime_exit and not len(run.tick) else assessment.exit_code
+
+
+def _about(rig: Rig, robot_file: str, model: Path, task: str, steps: int | None, count: int) -> dict[str, str]:
+    """What ran, for the report. steps: of the option; count: control steps of the run."""
+    from modsoft.hil import record
+
+    robot, board = rig.robot, rig.board
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": f"modsoft-hil --robot {Path(robot_file).name} --model {model.name} --task {Path(task).name} "
+        f"--board {board.board}" + (f" --steps {steps}" if steps else ""),
+        "board": record.board_description(board.board),
+        "board's clock": board.clock,
+        "firmware, SHA-256": record.firmware_sha256(board.board),
+        "model, SHA-256": hashlib.sha256(model.read_bytes()).hexdigest(),
+        "robot": f"{robot.name}, {robot.modules} modules, {robot.loop.hz:g} Hz",
+        "task": f"{task}, {count} control steps",
+    }
 
 
 def _check_system() -> None:
