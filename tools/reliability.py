@@ -117,6 +117,23 @@ ROWS: dict[int, Row] = {
     28: Row("firmware hangs", "watchdog", "outputs 0 in 130 ms"),
     29: Row("pressure sensor stuck, over-pressure, leak", "fault, vent", "dump in 110 ms; leak in 2.1 s"),
     30: Row("host does not read", "board keeps controlling", "loop jitter below 2 ms"),
+    31: Row(
+        "bit 7 set in the tracker's replies, which are not text then",
+        "runtime lives; client continues or starts again",
+        "serial port: no frame lost; network: frames again in 10 s",
+    ),
+    32: Row("wrong checksums in the tracker's replies", "as the limits of the robot file allow", "0 used; no restart"),
+    33: Row("lost carriage return of the tracker's reply", "client does not block", "frames again in 0.8 s"),
+    34: Row("tracker's client killed, crashed, halted", "client starts again", "frames again in 10 s"),
+    35: Row("trackers of other frame rates", "rate learned; delays detected", "no false alarm; 0 delayed frames used"),
+    36: Row("tool out of the volume, with an error status or a large RMS error", "invalid", "0 used; vent as row 13"),
+    37: Row("jump that stays", "invalid until 3 more frames agree", "shipped limits: vent as row 13"),
+    38: Row("tool of five degrees of freedom", "refused at the start", "all places"),
+    39: Row(
+        "random damage to bytes of the tracker's replies",
+        "no crash, no wrong configuration",
+        "10^4 replies in tests, 10^5 on demand: 0 and 0; a run that the limits allow continues",
+    ),
 }
 
 CLOCKS = {"emulated": "board's cycles", "virtual": "injected", "host": "wall", "none": ""}

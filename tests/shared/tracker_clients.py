@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from modsoft.runtime.errors import DeviceAbsent, UsageError
-from modsoft.runtime.tracking import client_process
+from modsoft.runtime.tracking import client_process, ndi
 from modsoft.runtime.tracking.frame import FrameError, TrackerFrame
 
 
@@ -79,3 +79,9 @@ def crash():
 def printing(folder):
     os.write(1, b"PING 127.0.0.1\n")
     return Client(folder, frames=10**9)
+
+
+def unpaced_ndi(*settings):
+    """Requests frames as fast as the device replies, with a short pause for a lost carriage return."""
+    ndi.REPLY_TENTHS = 1
+    return ndi.NDI(*settings, wait=lambda seconds: None)
