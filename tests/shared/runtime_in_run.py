@@ -56,8 +56,9 @@ class Stand:
     Needs far less of a core than the rig, which simulates the robot: several of them run side by side.
     """
 
-    def __init__(self, board="auto", angles_deg=(1.0, 2.0, -3.0)):
+    def __init__(self, board="auto", angles_deg=(1.0, 2.0, -3.0), tracker_options=()):
         self.board = EmulatedBoard(board)
+        self._tracker_options = tracker_options
         self._poses = planar_poses(angles_deg)
         self._exits = contextlib.ExitStack()
 
@@ -65,7 +66,8 @@ class Stand:
         with self._exits as exits:
             folder = Path(exits.enter_context(tempfile.TemporaryDirectory(prefix="modsoft-stand-")))
             self.tracker_port = str(folder / "ttyPolaris")
-            self.tracker = Child("modsoft.hil.polaris", ["--link", self.tracker_port], lambda line: None)
+            options = ["--link", self.tracker_port, *self._tracker_options]
+            self.tracker = Child("modsoft.hil.polaris", options, lambda line: None)
             exits.callback(self.tracker.stop)
             self.tool_files = write_tool_files(folder, len(self._poses))
             self.tracker.wait_ready()
