@@ -1,7 +1,7 @@
-"""One run from beginning to end: the order of start, and every way out.
+"""One run from start to end.
 
-Order: robot file, model, task, tracker, warm-up of the model, and only then the valve port. Whatever happens from
-arming on, the valves are vented before anything else, and "vented" is only said after the board said so.
+Order of start: robot file, model, task, tracker, warm-up of the model, and only then the valve port. After arming, any
+end of the run vents the valves first (`shutdown.py`); "vented" is reported only after the board confirms it.
 """
 
 from __future__ import annotations
@@ -14,40 +14,38 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 import msgspec
 
-from modsoft.runtime import log as logs
 from modsoft.runtime import robot as robots
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.dry_run import DryRunBoard
 from modsoft.runtime.board.ports import describe_ports, find_port
-from modsoft.runtime.board.protocol import VentMode
 from modsoft.runtime.clock import Ticker, spinning
 from modsoft.runtime.control import correction
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import load_task, task_of
 from modsoft.runtime.errors import (
-    INTERNAL_EXIT_CODE,
     DeviceAbsent,
     LostInRun,
     ModelError,
     ModsoftError,
     RobotFileError,
-    Tripped,
     UsageError,
 )
 from modsoft.runtime.files import read_text
-from modsoft.runtime.log_record import EndRecord
+from modsoft.runtime.log import RunLog
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameValidator, check_rest
+from modsoft.runtime.shutdown import finish
 from modsoft.runtime.statistics import TickStatistics
-from modsoft.runtime.status_line import StatusLine
-from modsoft.runtime.stop import Keys, Signals, Stop, StopKey
+from modsoft.runtime.stop import Keys, Signals, Stop
+from modsoft.runtime.terminal import StatusLine, say
 from modsoft.runtime.tracking.frame import LatestFrame
 from modsoft.runtime.tracking.reader import Reader
 from modsoft.runtime.tracking.sources import open_source, port_of
@@ -58,7 +56,7 @@ FIRST_FRAME_WAIT_S = 5.0
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line said; empty where the robot file decides."""
+    """The options of the command line; empty where the robot file decides."""
 
     robot: str
     model: Path
@@ -74,25 +72,43 @@ class Options:
     dry_run: bool
 
 
-def run(options: Options) -> None:
-    """The whole run. Returns after the last step, with the valves vented by the board's own word (or after a dry run);
-    raises what ended it earlier."""
-    said = time.perf_counter()
-    robot, robot_text, beside = _robot(options)
-    port = ""
-    if not options.dry_run:
-        if robot.tracker.source == "replay":
-            raise UsageError(
-                "recorded frames say nothing of where the robot is, so no valve is driven by them; "
-                "give --dry-run, or --tracker ndi"
-            )
-        port = _port(options.port or robot.serial.port)
-    controller, digest = _model(options.model, robot)
-    task = options.task or task_of(robot, beside)
-    desired = _task(task, robot)[: options.steps]
-    tools = list(options.tools) or [beside / tool for tool in robot.tracker.tools]
+@dataclass(frozen=True)
+class Setup:
+    """A run as it is read from files, before any device is opened."""
 
-    stop = Stop()
+    options: Options
+    robot: Robot
+    robot_text: str  # of the robot file
+    port: str  # of the board, empty in a dry run
+    tracker_port: str
+    tools: list[Path]
+    model: Model
+    model_sha256: str
+    task: str
+    desired: Array  # (K, N, 3)
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """For the log."""
+        description = msgspec.to_builtins(self.model.description)
+        description.pop("golden", None)
+        return {
+            "command": sys.argv[1:],
+            "robot": self.robot.to_dict(),
+            "task": self.task,
+            "steps": len(self.desired),
+            "correction": self.options.correction,
+            "model": {"file": str(self.options.model), "sha256": self.model_sha256, "description": description},
+            "port": self.port or None,
+        }
+
+
+def run(options: Options) -> None:
+    """A whole run. Returns after the last step, when the board has confirmed the venting (or after a dry run); raises
+    what ended it earlier."""
+    began_s = time.perf_counter()
+    setup = _setup(options)
+    robot, stop, frames = setup.robot, Stop(), LatestFrame()
     keys = Keys(stop)
 
     def leave(code: int) -> None:
@@ -101,110 +117,86 @@ def run(options: Options) -> None:
 
     with ExitStack() as exits:
         signals = exits.enter_context(Signals(stop, leave))
-        slot = LatestFrame()
-        reader = Reader(open_source(robot, options.tracker_port or port_of(robot, beside), tools), slot)
-        exits.callback(reader.close)
-        rest = _rest(slot, FrameValidator(robot), stop)
-        controller.warm_up(robot.modules)
-        _say(f"robot {robot.name}, {robot.modules} modules, hangs at {_angles(rest)} degrees")
-        _say(f"model {options.model}, task {task}: {len(desired)} steps, {len(desired) * robot.loop.period_s:.0f} s")
-        _say(f"correction {options.correction}")
-
+        exits.callback(Reader(open_source(robot, setup.tracker_port, setup.tools), frames).close)
+        rest = _rest(frames, FrameValidator(robot), stop)
+        setup.model.warm_up(robot.modules)
+        _describe(setup, rest)
         board = None
         if not options.dry_run:
-            board = Board.open(port, robot.serial.baud)
+            board = Board.open(setup.port, robot.serial.baud)
             exits.callback(board.close)
-        _say(f"ready {time.perf_counter() - said:.1f} s after the start")
+        say(f"ready {time.perf_counter() - began_s:.1f} s after the start")
         if board is not None and not options.yes:
-            _ask()
-        tally = TickStatistics(robot, len(desired))
+            _confirm()
+        statistics = TickStatistics(robot, len(setup.desired))
         signals.hold()  # from here on there is a log to be closed
-        log = logs.RunLog(
-            options.runs,
-            robot.name,
-            robot_text,
-            {
-                "command": sys.argv[1:],
-                "robot": robot.to_dict(),
-                "task": task,
-                "steps": len(desired),
-                "correction": options.correction,
-                "model": {"file": str(options.model), "sha256": digest, "description": _described(controller)},
-                "board": None if board is None else board.hello._asdict(),
-                "port": port or None,
-            },
-        )
+        meta = {**setup.meta, "board": None if board is None else board.hello._asdict()}
+        log = RunLog(options.runs, robot.name, setup.robot_text, meta)
         error: BaseException | None = None
         try:
             exits.enter_context(keys)
-            if board is not None:
-                board.arm(robot)
-            judge = FrameValidator(robot)  # a new one: Enter may have been long in coming
-            rest = _rest(slot, judge, stop, missing=LostInRun)
-            with StatusLine(lambda: _status(tally, log), sys.stderr):
-                Loop(
-                    robot,
-                    controller,
-                    desired,
-                    slot,
-                    judge,
-                    board or DryRunBoard(),
-                    Ticker(robot.loop.period_s, time.monotonic, spinning(stop.wait)),
-                    stop,
-                    log.put,
-                    tally,
-                    correction.by_name(options.correction, robot.modules),
-                    WarmUp(robot, judge, log.put),
-                ).run(rest)
-        except BaseException as raised:  # noqa: BLE001 - raised again below, after the venting
+            _control(setup, board, frames, stop, log, statistics)
+        except BaseException as raised:  # noqa: BLE001 - raised again after the venting
             error = raised
-        finish(board, log, tally, slot, error)
+        finish(board, log, statistics, frames, error)
 
 
-def finish(
-    board: Board | None, log: logs.RunLog, tally: TickStatistics, slot: LatestFrame, error: BaseException | None
+def _control(
+    setup: Setup, board: Board | None, frames: LatestFrame, stop: Stop, log: RunLog, statistics: TickStatistics
 ) -> None:
-    """Vents, closes the log, says what came of the run, and raises what ended it, if anything did."""
-    began_ns, vented_ns = time.monotonic_ns(), None
-    vented, pressed = False, dict[int, float]()
+    """Arms the board and runs the task; venting is the caller's."""
+    robot = setup.robot
     if board is not None:
-        try:
-            vented = board.vent(VentMode.DUMP if isinstance(error, StopKey) else VentMode.RAMP)
-            vented_ns = time.monotonic_ns() if vented else None
-            pressed = board.residual_pressures_bar() if vented else {}
-        except Exception as failed:  # noqa: BLE001 - the log must still be closed; the board's own timer vents
-            error = error or failed
-        if not vented and error is None:
-            error = LostInRun("the task was done, but the board never said that it is vented; look at the pressures")
-    if pressed:
-        found = ", ".join(f"channel {channel} still measures {bar:.2f} bar" for channel, bar in pressed.items())
-        before = f" (the run ended before that: {str(error) or type(error).__name__})" if error is not None else ""
-        advice = "shut off the air, then look at that valve and its sensor"
-        stuck = Tripped(f"the valves are commanded to 0, but {found}: {advice}{before}")
-        stuck.__cause__ = error
-        error = stuck
-    code, reason = 0, "done"
-    if error is not None:
-        code = error.exit_code if isinstance(error, ModsoftError) else INTERNAL_EXIT_CODE
-        reason = str(error) or type(error).__name__
-    log.put(EndRecord(began_ns, code, reason, vented, vented_ns, pressed))
-    if board is None:
-        word = "dry run, no valve was touched"
-    else:
-        word = "yes, said by the board" if vented else "NOT KNOWN, the board did not say so; look at the pressures"
-    for line in [*tally.summary(), f"valves vented: {word}"]:  # before the log: a disk may hang
-        _say(line)
-    figures = {"figures": tally.figures(), "tracker": dict(slot.counts), "vented": vented}
-    log.close(code, reason, {**figures, "connection": None if board is None else board.statistics})
-    _say(f"log: {log.folder}")
-    if log.trouble:
-        _say(f"log: {log.trouble}")
-    if error is not None:
-        raise error
+        board.arm(robot)
+    validator = FrameValidator(robot)  # a new one: the operator may have taken long to confirm
+    rest = _rest(frames, validator, stop, missing=LostInRun)
+    with StatusLine(lambda: _status(statistics, log), sys.stderr):
+        Loop(
+            robot,
+            setup.model,
+            setup.desired,
+            frames,
+            validator,
+            board or DryRunBoard(),
+            Ticker(robot.loop.period_s, time.monotonic, spinning(stop.wait)),
+            stop,
+            log.put,
+            statistics,
+            correction.by_name(setup.options.correction, robot.modules),
+            WarmUp(robot, validator, log.put),
+        ).run(rest)
+
+
+def _setup(options: Options) -> Setup:
+    """Reads and checks robot file, model and task."""
+    robot, robot_text, folder = _robot(options)
+    port = ""
+    if not options.dry_run:
+        if robot.tracker.source == "replay":
+            raise UsageError(
+                "recorded frames do not show where the robot is, so no valve can follow them; "
+                "give --dry-run, or --tracker ndi"
+            )
+        port = _port(options.port or robot.serial.port)
+    model, sha256 = _model(options.model, robot)
+    task = options.task or task_of(robot, folder)
+    desired = _task(task, robot)[: options.steps]
+    tools = list(options.tools) or [folder / tool for tool in robot.tracker.tools]
+    tracker_port = options.tracker_port or port_of(robot, folder)
+    return Setup(options, robot, robot_text, port, tracker_port, tools, model, sha256, task, desired)
+
+
+def _describe(setup: Setup, rest: Array) -> None:
+    """Reports what is going to run. rest: configuration (N, 3)."""
+    robot, steps = setup.robot, len(setup.desired)
+    angles = ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in bending_angle_deg(rest))  # not -0.0
+    say(f"robot {robot.name}, {robot.modules} modules, hangs at {angles} degrees")
+    say(f"model {setup.options.model}, task {setup.task}: {steps} steps, {steps * robot.loop.period_s:.0f} s")
+    say(f"correction {setup.options.correction}")
 
 
 def _robot(options: Options) -> tuple[Robot, str, Path]:
-    """The robot with what the command line changes in it, its file's text, and the folder that its paths start from."""
+    """The robot with the options applied, the text of its file, and the folder that its paths are relative to."""
     path = Path(options.robot)
     if not path.is_file() and options.robot == "robot.toml":
         raise RobotFileError(
@@ -225,88 +217,69 @@ def _robot(options: Options) -> tuple[Robot, str, Path]:
     return robot, text, robots.folder_of(path)
 
 
-def _port(told: str) -> str:
-    """The board's port, which is there. It is not opened: that comes last."""
-    if not told:
+def _port(name: str) -> str:
+    """The board's port, which exists. It is opened last."""
+    if not name:
         raise UsageError(
-            f"the board's port is not told; give --port, or port under [serial] in the robot file; {describe_ports()}"
+            f"no board port given: use --port, or set port under [serial] in the robot file; {describe_ports()}"
         )
-    return find_port(told)
+    return find_port(name)
 
 
 def _model(path: Path, robot: Robot) -> tuple[Model, str]:
-    """The controller, proven and of this robot, and its file's SHA-256."""
+    """The model, checked against the robot, and the SHA-256 of its file."""
     if not path.is_file():
         raise ModelError(f"no model {str(path)!r} here; give --model FILE, a file that modsoft-export wrote")
-    controller = Model.load(path)
-    controller.check(robot)
-    return controller, hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _described(controller: Model) -> dict[str, object]:
-    """What the model says about itself, without the golden pairs."""
-    said = msgspec.to_builtins(controller.description)
-    said.pop("golden", None)
-    return said
+    model = Model.load(path)
+    model.check(robot)
+    return model, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _task(task: str, robot: Robot) -> Array:
     if not task:
-        raise UsageError("the task is not told; give --task, or task under [loop] in the robot file")
+        raise UsageError("no task given: use --task, or set task under [loop] in the robot file")
     return load_task(task, robot)
 
 
 def _rest(
-    slot: LatestFrame,
-    judge: FrameValidator,
+    frames: LatestFrame,
+    validator: FrameValidator,
     stop: Stop,
     now: Callable[[], float] = time.monotonic,
     missing: type[ModsoftError] = DeviceAbsent,
 ) -> Array:
-    """The configuration (N, 3) in which the vented robot hangs; waits for the tracker's first good frame. Raises
-    `missing` where there is none."""
+    """The configuration (N, 3) of the vented robot; waits for the first valid frame of the tracker. Raises `missing`
+    without one."""
     until_s = now() + FIRST_FRAME_WAIT_S
     while True:
-        frame = slot.latest()
-        judged = judge.judge(frame, now())
-        if frame is not None and judged.configuration is not None:
-            check_rest(judged.configuration, frame.poses)
-            return judged.configuration
-        if slot.error is not None:
-            raise missing(f"tracker: {slot.error}")
+        frame = frames.latest()
+        check = validator.judge(frame, now())
+        if frame is not None and check.configuration is not None:
+            check_rest(check.configuration, frame.poses)
+            return check.configuration
+        if frames.error is not None:
+            raise missing(f"tracker: {frames.error}")
         if now() > until_s:
-            detail = judged.detail or slot.problem
+            detail = check.detail or frames.problem
             detail = f" ({detail})" if detail else ""
             raise missing(
-                f"tracker: no good frame within {FIRST_FRAME_WAIT_S:.0f} s, the last one {judged.word}{detail}; "
+                f"tracker: no good frame within {FIRST_FRAME_WAIT_S:.0f} s, the last one {check.word}{detail}; "
                 "are all tools in view?"
             )
         stop.wait(0.01)
         stop.check()
 
 
-def _ask() -> None:
-    """Arming is a person's decision."""
-    click.echo("Chambers at 0 bar? Nobody near the robot? Press Enter to arm, Ctrl-C to leave. ", err=True, nl=False)
+def _confirm() -> None:
+    """Waits for the operator's Enter, which confirms arming."""
+    click.echo("Chambers at 0 bar? No person near the robot? Press Enter to arm, Ctrl-C to leave. ", err=True, nl=False)
     try:
-        answered = sys.stdin.readline()
+        line = sys.stdin.readline()
     except (OSError, ValueError):
-        answered = ""
-    if not answered:
-        raise UsageError("arming asks for Enter, and there is nobody to press it; give --yes")
+        line = ""
+    if not line:
+        raise UsageError("arming needs Enter, and standard input is closed; give --yes")
 
 
-def _status(tally: TickStatistics, log: logs.RunLog) -> str:
-    return tally.status + (f"  LOG: {log.trouble}" if log.trouble else "")
-
-
-def _say(text: str) -> None:
-    """A line for the person at the terminal, who may have left."""
-    try:
-        click.echo(text, err=True)
-    except (OSError, ValueError):
-        pass
-
-
-def _angles(configuration: Array) -> str:
-    return ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in bending_angle_deg(configuration))  # not -0.0
+def _status(statistics: TickStatistics, log: RunLog) -> str:
+    return statistics.status + (f"  LOG: {log.trouble}" if log.trouble else "")

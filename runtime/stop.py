@@ -1,5 +1,5 @@
-"""What a person or the system does to end a run: signals and the stop keys. The first request wins and is obeyed by
-the loop; a second Ctrl-C or SIGTERM leaves at once, and then the board's own timer vents."""
+"""Requests to end a run: signals and the stop keys. The first request counts and the loop obeys it; a second Ctrl-C or
+SIGTERM ends the process at once, and then the board's own timer vents."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 
 from modsoft.runtime.errors import ModsoftError, Tripped
 from modsoft.runtime.locks import system_module
+from modsoft.runtime.terminal import TerminalThread
 
 STOP_KEYS = (" ", "q", "\x1b")  # space, q, Esc
 # SIGHUP does not exist on Windows.
@@ -29,18 +30,18 @@ class Interrupted(ModsoftError):
 
 
 class StopKey(Tripped):
-    """A person pressed a stop key."""
+    """The operator pressed a stop key."""
 
 
 class Stop:
-    """The one flag. `wait` is what the loop sleeps with, so that a request wakes it."""
+    """The stop request of a run. The loop sleeps in `wait`, which a request ends."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
         self.error: ModsoftError | None = None
 
     def request(self, error: ModsoftError) -> None:
-        """Asks for the end; only the first reason is kept."""
+        """Requests the end of the run; only the first reason is kept."""
         if self.error is None:
             self.error = error
         self._event.set()
@@ -49,7 +50,7 @@ class Stop:
         self._event.wait(seconds)
 
     def check(self) -> None:
-        """Raises what was asked for."""
+        """Raises the reason of a request."""
         if self.error is not None:
             raise self.error
 
@@ -57,15 +58,15 @@ class Stop:
 class Signals:
     """While entered, signals become requests.
 
-    Before `hold` a signal raises at once, wherever the program is: nothing is under pressure yet, and connecting to a
-    device can take seconds. From `hold` on it only sets the flag, so that venting is never cut short.
+    Before `hold` a signal raises at once: nothing is under pressure yet, and connecting to a device can take seconds.
+    After `hold` it only makes the request, so that no signal interrupts the venting.
     """
 
     def __init__(self, stop: Stop, leave: Callable[[int], Any] = os._exit):
         self._stop = stop
         self._leave = leave
         self._holding = False
-        self._asked = False
+        self._requested = False
         self._before: dict[int, Any] = {}
 
     def hold(self) -> None:
@@ -84,45 +85,39 @@ class Signals:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         error = Interrupted(number)
-        if self._asked:
-            # A terminal that closes sends SIGHUP, and its shell a second one: that is nobody's impatience.
+        if self._requested:
+            # When a terminal closes, it sends SIGHUP and its shell a second one, which no person requested.
             if number in (signal.SIGINT, signal.SIGTERM):
                 self._leave(error.exit_code)
             return
-        self._asked = True
+        self._requested = True
         self._stop.request(error)
         if not self._holding:
             raise error
 
 
-class Keys:
-    """While entered, the stop keys of a terminal become requests. Nothing happens where stdin is no terminal, or one
-    that this process may not read from."""
+class Keys(TerminalThread):
+    """While entered, the stop keys of a terminal become requests. Does nothing if stdin is not a terminal, or one that
+    this process may not read."""
 
     def __init__(self, stop: Stop):
+        super().__init__("keys", end_wait_s=1.0)
         self._stop = stop
-        self._done = threading.Event()
-        self._thread: threading.Thread | None = None
         self._restore: Callable[[], None] | None = None
 
-    def __enter__(self) -> Keys:
+    def _target(self) -> Callable[[], None] | None:
         termios, tty, msvcrt = map(system_module, ("termios", "tty", "msvcrt"))
         read = self._posix(termios, tty) if termios and tty else self._windows(msvcrt) if msvcrt else None
-        if read is not None:
-            self._thread = threading.Thread(target=self._run, args=(read,), name="keys", daemon=True)
-            self._thread.start()
-        return self
+        return None if read is None else lambda: self._run(read)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._done.set()
-        if self._thread is not None:
-            self._thread.join(1.0)
+        super().__exit__(kind, error, trace)
         self.restore()
 
     def restore(self) -> None:
-        """Gives the terminal back as it was."""
+        """Restores the settings of the terminal."""
         if self._restore is not None:
             self._restore()
 
@@ -133,12 +128,12 @@ class Keys:
                 return
 
     def _posix(self, termios: Any, tty: Any) -> Callable[[], str] | None:
-        if sys.stdin is None:  # closed by whoever started the program
+        if sys.stdin is None:  # closed by the parent process
             return None
         try:
             terminal = sys.stdin.fileno()
             if not os.isatty(terminal) or os.tcgetpgrp(terminal) != os.getpgrp():
-                return None  # a background job that touched its terminal would be stopped
+                return None  # the system stops a background job that uses its terminal
             before = termios.tcgetattr(terminal)
             tty.setcbreak(terminal)  # Ctrl-C stays a signal
         except (OSError, ValueError, termios.error):
@@ -159,7 +154,7 @@ class Keys:
                 key = os.read(terminal, 1)
             except OSError:
                 key = b""
-            if not key:  # the terminal is gone; SIGHUP tells so too
+            if not key:  # the terminal is closed; SIGHUP comes too
                 self._done.wait(0.05)
             return key.decode("latin-1")
 

@@ -17,7 +17,7 @@ from modsoft.runtime.errors import LostInRun, Tripped
 pytestmark = pytest.mark.realtime
 
 BOARD_ALONE_S = 0.8  # after that it has vented by its own timer
-VENTED = "valves vented: yes, said by the board"
+VENTED = "valves vented: yes, confirmed by the board"
 UNKNOWN = "valves vented: NOT KNOWN"
 
 

@@ -58,7 +58,7 @@ def test_row_12_every_exit_path_vents_at_any_phase(name, matrix_row, full, tmp_p
             assert max(emulated.duties()) == 0.0
             assert not run.forced_exits, "no forced exit"
             reports = [(highest, line) for _, highest, line in run.messages if line.startswith("valves vented")]
-            word = "yes, said by the board" if can_confirm else "NOT KNOWN"
+            word = "yes, confirmed by the board" if can_confirm else "NOT KNOWN"
             assert len(reports) == 1
             assert word in reports[0][1]
             assert reports[0][0] == 0.0 or not can_confirm, "reported while a valve was open"

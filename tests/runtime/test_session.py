@@ -5,7 +5,7 @@ import json
 import pytest
 
 from modsoft.runtime import robot as robots
-from modsoft.runtime import session
+from modsoft.runtime import session, shutdown
 from modsoft.runtime.board.protocol import VentMode
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped, UsageError
 from modsoft.runtime.log import RunLog
@@ -40,7 +40,7 @@ class Ending:
         log = RunLog(tmp_path, "arm", "", {})
         self.raised = None
         try:
-            session.finish(board, log, TickStatistics(ROBOT, 10), LatestFrame(), error)
+            shutdown.finish(board, log, TickStatistics(ROBOT, 10), LatestFrame(), error)
         except BaseException as raised:  # noqa: BLE001 - looked at by the test
             self.raised = raised
         self.said = capsys.readouterr().err
@@ -53,7 +53,7 @@ def test_done(tmp_path, capsys):
     ending = Ending(tmp_path, capsys, board)
     assert ending.raised is None
     assert board.modes == [VentMode.RAMP]
-    assert "valves vented: yes, said by the board" in ending.said
+    assert "valves vented: yes, confirmed by the board" in ending.said
     assert (ending.meta["exit_code"], ending.meta["reason"], ending.meta["vented"]) == (0, "done", True)
     assert (ending.end["event"], ending.end["exit_code"], ending.end["vented"]) == ("end", 0, True)
 
@@ -62,7 +62,7 @@ def test_done(tmp_path, capsys):
 def test_a_board_that_does_not_say_so_is_not_vented(tmp_path, capsys, word):
     ending = Ending(tmp_path, capsys, Board(word))
     assert isinstance(ending.raised, LostInRun | OSError)
-    assert "yes, said" not in ending.said
+    assert "yes, confirmed" not in ending.said
     assert "NOT KNOWN" in ending.said
     assert ending.meta["exit_code"] in (74, 70)
     assert ending.meta["vented"] is False
@@ -89,7 +89,7 @@ def test_what_ended_the_run_is_raised_after_the_venting(tmp_path, capsys, error,
     assert board.modes == [VentMode.RAMP]
     assert ending.meta["exit_code"] == code
     assert ending.meta["reason"]
-    assert ("yes, said" in ending.said) == word
+    assert ("yes, confirmed" in ending.said) == word
 
 
 @pytest.mark.parametrize("error", [None, Interrupted(2), LostInRun("tracker lost")])
@@ -114,13 +114,13 @@ def test_the_venting_is_told_although_the_disk_hangs(tmp_path, capsys, monkeypat
     said = []
     monkeypatch.setattr(RunLog, "close", lambda *told: said.append(capsys.readouterr().err))
     log = RunLog(tmp_path, "arm", "", {})
-    session.finish(Board(True), log, TickStatistics(ROBOT, 10), LatestFrame(), None)
-    assert "valves vented: yes, said by the board" in said[0]
+    shutdown.finish(Board(True), log, TickStatistics(ROBOT, 10), LatestFrame(), None)
+    assert "valves vented: yes, confirmed by the board" in said[0]
 
 
 def test_a_dry_run_says_so(tmp_path, capsys):
     ending = Ending(tmp_path, capsys, None)
-    assert "no valve was touched" in ending.said
+    assert "no valve was used" in ending.said
     assert "yes" not in ending.said
     assert ending.meta["vented"] is False
 
@@ -130,9 +130,9 @@ def test_arming_needs_somebody(monkeypatch):
 
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     with pytest.raises(UsageError, match="--yes"):
-        session._ask()
+        session._confirm()
     monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
-    session._ask()
+    session._confirm()
 
 
 def test_no_frame_is_waited_for_only_so_long(monkeypatch):

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from modsoft.runtime.errors import Tripped
-from modsoft.runtime.status_line import StatusLine
 from modsoft.runtime.stop import SIGNALS, Interrupted, Keys, Signals, Stop, StopKey
+from modsoft.runtime.terminal import StatusLine
 
 CODES = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129}
 NUMBERS = {getattr(signal, name): code for name, code in CODES.items() if hasattr(signal, name)}

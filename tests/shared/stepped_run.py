@@ -11,7 +11,7 @@ import numpy as np
 from stepped_port import SteppedPort
 from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
-from modsoft.runtime import session
+from modsoft.runtime import session, shutdown
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.clock import Ticker
 from modsoft.runtime.control.features import from_angles_deg
@@ -71,7 +71,7 @@ class SteppedRun:
     def go(self):
         """Arms, runs, vents and closes."""
         desired = from_angles_deg(np.zeros((STEPS, ROBOT.modules)))
-        say, session._say = session._say, self.say
+        say, shutdown.say = shutdown.say, self.say
         error = None
         try:
             with Signals(self.stop, self.forced_exits.append) as signals:
@@ -96,9 +96,9 @@ class SteppedRun:
                 except BaseException as raised:  # noqa: BLE001 - as in the session itself
                     error = raised
                 with contextlib.closing(self.board):
-                    session.finish(self.board, self.log, self.statistics, self.frames, error)
+                    shutdown.finish(self.board, self.log, self.statistics, self.frames, error)
         except BaseException as raised:  # noqa: BLE001 - looked at by the test
             self.error = raised
         finally:
-            session._say = say
+            shutdown.say = say
         return self
