@@ -1,10 +1,12 @@
 """The failure matrix: runs its tests and writes docs/reliability.md from the lines that they print.
 
 `make reliability` runs tests/reliability with few tries, `tools/reliability.py --full` with the numbers of the matrix.
+--full keeps the result of each test in a folder: the same command on the same commit skips the finished ones, and
+writes the page once all tests have a result. To repeat a test, delete its file there.
 Exit code 1 if a row is missing or not met.
 """
 
-from __future__ import annotations
+from __future__ import annotations  # above 300 lines: more than a third is the table of the rows
 
 import json
 import os
@@ -18,10 +20,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
+import reliability_full
 
 from modsoft.runtime import log
 from modsoft.runtime.entry_point import entry
-from modsoft.runtime.errors import ModelError
+from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.files import check_not_input, read_text, written
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -140,8 +143,8 @@ CLOCKS = {"emulated": "board's cycles", "virtual": "injected", "host": "wall", "
 
 HEAD = """# The failure matrix
 
-Each fault is injected by its own test in `tests/reliability/`. Made by `{command}` from the lines that the tests print,
-on {date}, {system}, {cores} cores. {score}
+Each fault is injected by its own test in `tests/reliability/`. Made by `{command}`{commit} from the lines that the
+tests print, on {date}, {system}, {cores} cores. {score}
 
 - A row: the fault, the required reaction, and the limit. It has several lines where it was tested twice (the firmware's
   logic compiled for the PC; the compiled firmware on the emulated board) or has several faults.
@@ -162,10 +165,9 @@ the real robot at low pressure.
 """
 
 
-def read(path: Path) -> dict[int, list[Line]]:
-    """The lines of each row, in the order of their tests. A repeated line replaces the first, so that a file may be
-    extended. `ModelError` for an invalid line."""
-    rows: dict[int, dict[tuple[str, str], Line]] = defaultdict(dict)
+def read(path: Path) -> list[Line]:
+    """The lines of a file. `ModelError` for an invalid line."""
+    lines = []
     for number, text in enumerate(read_text(path).splitlines(), start=1):
         try:
             line = json.loads(text)
@@ -174,8 +176,17 @@ def read(path: Path) -> dict[int, list[Line]]:
             missing = list(FIELDS)
         if missing:
             raise ModelError(f"{path}: line {number} has no {', '.join(missing)}; write it with pytest --matrix")
+        lines.append(line)
+    return lines
+
+
+def by_row(lines: Iterable[Line]) -> dict[int, list[Line]]:
+    """The lines of each row, in the order of their tests. A repeated line replaces the first, so that a file may be
+    extended."""
+    rows: dict[int, dict[tuple[str, str], Line]] = defaultdict(dict)
+    for line in lines:
         rows[line["row"]][(line["test"], line["fault"])] = line
-    return {row: sorted(lines.values(), key=lambda line: line["test"]) for row, lines in sorted(rows.items())}
+    return {row: sorted(each.values(), key=lambda line: line["test"]) for row, each in sorted(rows.items())}
 
 
 def met(lines: Iterable[Line]) -> bool:
@@ -214,17 +225,18 @@ def score(rows: dict[int, list[Line]]) -> str:
     return text
 
 
-def page(rows: dict[int, list[Line]], command: str) -> str:
-    """docs/reliability.md."""
+def page(rows: dict[int, list[Line]], command: str, commit: str = "") -> str:
+    """docs/reliability.md. commit: that was tested; empty if it is not known."""
     host, date = log.host(), f"{datetime.now(UTC):%Y-%m-%d}"
-    head = HEAD.format(command=command, date=date, system=host["system"], cores=host["cores"], score=score(rows))
+    at_commit = f" at commit {commit}" if commit else ""
+    facts = {"date": date, "system": host["system"], "cores": host["cores"], "score": score(rows)}
+    head = HEAD.format(command=command, commit=at_commit, **facts)
     return f"{head}\n{table(rows)}\n{TAIL}"
 
 
-def run_tests(lines: Path, full: bool) -> int:
+def run_tests(lines: Path) -> int:
     """Runs all tests of the matrix, those against the wall clock last and alone; returns the first exit code not 0."""
     common = [sys.executable, "-m", "pytest", "-q", "tests/reliability", "--matrix", str(lines)]
-    common += ["--matrix-full", "--timeout", "7200"] if full else []
     codes = [
         subprocess.run([*common, *options], cwd=ROOT, check=False).returncode
         for options in (["-n", str(min(2, os.cpu_count() or 1)), "-m", "not realtime"], ["-m", "realtime"])
@@ -232,8 +244,32 @@ def run_tests(lines: Path, full: bool) -> int:
     return next((code for code in codes if code), 0)
 
 
+def full_matrix(work: Path | None, rows: str | None, out: Path) -> int:
+    """Runs the tests of these rows (None: all) with their full numbers; writes the page if no test is left."""
+    chosen = reliability_full.parse_rows(rows) if rows else set(ROWS)
+    if unknown := chosen - set(ROWS):
+        raise UsageError(f"--rows {rows}: found row {min(unknown)}, expected 1 to {max(ROWS)}")
+    results, left, commit = reliability_full.run(ROOT, work, chosen, click.echo)
+    lines = by_row(line for result in results for line in result.lines)
+    code = int(any(result.exit_code for result in results))
+    if left:
+        have = {row for result in results for row in result.test.rows} & chosen
+        click.echo(f"{left} tests have no result, and the page is not written: run it again without --rows")
+        return int(code or have != chosen or not all(met(lines.get(row, [])) for row in chosen))
+    with written(out) as new:
+        new.write_text(page(lines, "tools/reliability.py --full", commit), encoding="utf-8")
+    click.echo(f"{score(lines)} {out}")
+    return int(code or not all(met(lines.get(row, [])) for row in ROWS))
+
+
 @click.command("reliability", help=__doc__, context_settings={"show_default": True})
-@click.option("--full", is_flag=True, help="The numbers of tries of the matrix; takes hours.")
+@click.option("--full", is_flag=True, help="The numbers of tries of the matrix; takes hours, and can be interrupted.")
+@click.option("--rows", help="With --full: only the tests of these rows, such as 31-39,45.  [default: all]")
+@click.option(
+    "--work",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="With --full: folder of the results, of one commit.  [default: build/reliability-COMMIT]",
+)
 @click.option(
     "--lines",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
@@ -246,23 +282,28 @@ def run_tests(lines: Path, full: bool) -> int:
     show_default="docs/reliability.md",
     help="The page.",
 )
-def cli(full: bool, lines: Path | None, out: Path) -> int:
-    command = "tools/reliability.py --full" if full else "make reliability"
-    code = 0
+def cli(full: bool, rows: str | None, work: Path | None, lines: Path | None, out: Path) -> int:
     check_not_input(out, *([] if lines is None else [lines]))
+    if full and lines is not None:
+        raise UsageError("found --full and --lines, expected one of them: --full runs tests, --lines runs none")
+    if full:
+        return full_matrix(work, rows, out)
+    if rows or work:
+        raise UsageError(f"{'--rows' if rows else '--work'} is an option of --full; add --full")
+    code = 0
     with tempfile.TemporaryDirectory() as folder:
         if lines is None:
             lines = Path(folder) / "lines.jsonl"
             lines.touch()
-            code = run_tests(lines, full)
-        rows = read(lines)
+            code = run_tests(lines)
+        by_number = by_row(read(lines))
     with written(out) as new:
-        new.write_text(page(rows, command), encoding="utf-8")
-    click.echo(f"{score(rows)} {out}")
-    return 0 if not code and all(met(rows.get(row, [])) for row in ROWS) else 1
+        new.write_text(page(by_number, "make reliability"), encoding="utf-8")
+    click.echo(f"{score(by_number)} {out}")
+    return 0 if not code and all(met(by_number.get(row, [])) for row in ROWS) else 1
 
 
-main = entry(cli)
+main = entry(cli, resumable="--full" in sys.argv)
 
 if __name__ == "__main__":
     main()
