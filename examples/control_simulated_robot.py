@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import task
 from modsoft.training.simulation.fleet import simulated
@@ -13,7 +13,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "tools" / "models" / "pneumatic-
 
 
 def main() -> None:
-    robot = robots.load("pneumatic-3")
+    robot = robot_file.load("pneumatic-3")
     model = Model.load(Path(sys.argv[1]) if len(sys.argv) > 1 else SHIPPED)
     model.check(robot)  # trained for a robot of this kind?
     desired = task("down", "pneumatic", robot.modules)  # (K, N, 3), one configuration a control step

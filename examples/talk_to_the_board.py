@@ -10,13 +10,13 @@ from contextlib import ExitStack
 import numpy as np
 
 from modsoft.hil.board.emulator import EmulatedBoard
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import CHANNELS
 
 
 def main() -> None:
-    robot = robots.load("pneumatic-3")
+    robot = robot_file.load("pneumatic-3")
     with ExitStack() as exits:
         port = sys.argv[1] if len(sys.argv) > 1 else exits.enter_context(EmulatedBoard("native")).port
         board = exits.enter_context(Board.open(port, robot.serial.baud))

@@ -10,7 +10,7 @@ import msgspec
 import torch
 
 from modsoft.export import foreign
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import feature_names
 from modsoft.runtime.control.model_file import Network
 from modsoft.runtime.errors import ModelError, RobotFileError
@@ -64,9 +64,9 @@ def _robot(meta: Path, name: str) -> Robot:
     """The robot of a meta file: a file relative to it, or a shipped robot."""
     path = meta.parent / name
     if path.is_file():
-        return robots.load(path)
+        return robot_file.load(path)
     try:
-        return robots.shipped(name)
+        return robot_file.shipped(name)
     except RobotFileError as error:
         raise RobotFileError(f"{meta}: no robot file {path}, and no shipped robot {name!r}") from error
 
@@ -109,7 +109,7 @@ def network_of(checkpoint: dict[str, Any], where: str = "checkpoint") -> Network
 def _check(checkpoint: dict[str, Any], path: Path) -> None:
     """`ModelError` unless the checkpoint is consistent and its weights are finite float32."""
     try:
-        robot = robots.from_dict(checkpoint["robot"], f"{path}: robot")
+        robot = robot_file.from_dict(checkpoint["robot"], f"{path}: robot")
     except RobotFileError as error:  # in this file, not in a robot file that the user can correct
         raise ModelError(f"{error}; train it again with this version") from error
     network = network_of(checkpoint, str(path))

@@ -10,7 +10,7 @@ import msgspec
 
 from modsoft.export import bilstm_graph, load, parity
 from modsoft.export.nodes import Weights
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control import model_file
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.model_file import Description, Golden, Network
@@ -75,7 +75,7 @@ def _check_own(out: Path) -> None:
 
 def describe(checkpoint: dict[str, Any], sizes: Network, weights: Weights, expected: parity.Reference) -> Description:
     """The description of the exported model, with the placeholder of the checksum."""
-    robot = robots.from_dict(checkpoint["robot"])
+    robot = robot_file.from_dict(checkpoint["robot"])
     return Description(
         schema=model_file.SCHEMA,
         file_sha256=model_file.CHECKSUM_PLACEHOLDER,

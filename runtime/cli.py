@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.choices import CORRECTIONS
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import RobotFileError, UsageError
@@ -27,7 +27,7 @@ def _print_ports() -> None:
 def _check_robot(name: str) -> None:
     from modsoft.runtime.control.tasks import load_task, task_of  # --help does without numpy
 
-    robot, folder = robots.load(name), robots.folder_of(name)
+    robot, folder = robot_file.load(name), robot_file.folder_of(name)
     task, steps = task_of(robot, folder), 0
     if task:
         try:
@@ -51,7 +51,7 @@ def _check_robot(name: str) -> None:
     click.echo("ok")
 
 
-def _open_ends(robot: robots.Robot, beside: Path) -> list[str]:
+def _open_ends(robot: robot_file.Robot, beside: Path) -> list[str]:
     """What a valid robot file leaves to the command line, in words. Its paths start from the folder `beside`."""
     found = [] if robot.loop.task else ["task under [loop], or --task"]
     if robot.valve is None:
@@ -80,7 +80,7 @@ def _instead(list_ports: bool, check: str | None, print_robot: str | None) -> bo
     if check is not None:
         _check_robot(check)
     if print_robot is not None:
-        click.echo(robots.text_of(print_robot), nl=False)
+        click.echo(robot_file.text_of(print_robot), nl=False)
     return any(asked)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import click
 import msgspec
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.dry_run import DryRunBoard
@@ -203,7 +203,7 @@ def _robot(options: Options) -> tuple[Robot, str, Path]:
             "no robot.toml in this folder; give --robot FILE, or make one to start from: "
             "modsoft-runtime --print-robot pneumatic-3 > robot.toml"
         )
-    robot = robots.load(options.robot)
+    robot = robot_file.load(options.robot)
     if robot.kind != "pneumatic":
         raise RobotFileError(
             f"robot {robot.name} is of kind {robot.kind!r}, which is only simulated (modsoft-simulate); "
@@ -212,9 +212,9 @@ def _robot(options: Options) -> tuple[Robot, str, Path]:
     if options.tracker:
         table = robot.to_dict()
         table["tracker"]["source"] = options.tracker
-        robot = robots.from_dict(table, options.robot)
-    text = read_text(path, RobotFileError) if path.is_file() else robots.text_of(options.robot)
-    return robot, text, robots.folder_of(path)
+        robot = robot_file.from_dict(table, options.robot)
+    text = read_text(path, RobotFileError) if path.is_file() else robot_file.text_of(options.robot)
+    return robot, text, robot_file.folder_of(path)
 
 
 def _port(name: str) -> str:

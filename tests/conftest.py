@@ -66,12 +66,12 @@ def make_checkpoint():
     def make(path, robot="pneumatic-3", history=3, layers=2, hidden=8, gain=1.0, seed=0, name="bilstm"):
         torch = pytest.importorskip("torch")
 
-        from modsoft.runtime import robot as robots
+        from modsoft.runtime import robot as robot_file
         from modsoft.runtime.control.features import feature_names
         from modsoft.training import checkpoint as checkpoints
         from modsoft.training import networks
 
-        found = robots.load(robot)
+        found = robot_file.load(robot)
         names = feature_names(found.kind, history)
         sizes = {"name": name, "feature_size": len(names), "action_size": found.action_size, "layers": layers}
         sizes |= {"hidden": hidden, "dropout": 0.1, "history": history}

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control import tasks
 from modsoft.runtime.control.model import Model
 from modsoft.training.simulation import fleet_kernel, rollout
@@ -24,7 +24,7 @@ needs_fleet = pytest.mark.skipif(not fleet_kernel.variants(), reason="the fleet'
 )
 def test_a_shipped_model_is_of_its_robots_and_says_how_it_was_made(file, robot):
     controller = Model.load(MODELS / f"{file}.onnx")
-    controller.check(robots.load(robot))
+    controller.check(robot_file.load(robot))
     provenance = controller.description.provenance
     assert {"data_sha256", "iterations_done", "seed", "strategy", "code_version"} <= provenance.keys()
     assert f"{file}.onnx" in (MODELS / "README.md").read_text(encoding="utf-8")
@@ -38,7 +38,7 @@ def test_a_shipped_model_is_of_its_robots_and_says_how_it_was_made(file, robot):
 def test_a_shipped_model_drives_its_robot(file, robot, task, most):
     """most: of the mean error of any module, degrees or percent, over the first 60 steps; far more than was measured,
     far less than that of a model that does not drive."""
-    robot = robots.load(robot)
+    robot = robot_file.load(robot)
     controller = Model.load(MODELS / f"{file}.onnx")
     desired = tasks.task(task, robot.kind, robot.modules)[:60]
     setup = ControllerSetup(robot, controller.actuate, controller.history, desired)

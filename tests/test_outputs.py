@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from modsoft.export import cli as export_cli
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import UsageError
 from modsoft.study import report
 from modsoft.study.paths import Folder
@@ -24,7 +24,7 @@ features = "states and actions by time step, then label"
 @pytest.fixture
 def lab(tmp_path, monkeypatch):
     """A folder with one file of each kind that a command reads."""
-    (tmp_path / "robot.toml").write_text(robots.text_of("pneumatic-2"))
+    (tmp_path / "robot.toml").write_text(robot_file.text_of("pneumatic-2"))
     np.save(tmp_path / "a.npy", np.zeros((1, 2, 1)))
     for name in ("d.h5", "m.pt", "m.pt.resume"):
         (tmp_path / name).write_bytes(b"data")

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.choices import STRATEGIES
 from modsoft.runtime.entry_point import entry, renamed_option
 from modsoft.runtime.files import check_not_input, check_writable
@@ -20,7 +20,7 @@ from modsoft.runtime.files import check_not_input, check_writable
     invoke_without_command=True,
     subcommand_metavar="[plot DATASET... --out FILE.png]",
 )
-@click.option("--robot", "robot_file", help="Robot file, or a shipped robot's name (pneumatic-3, ...).  [required]")
+@click.option("--robot", "file_or_name", help="Robot file, or a shipped robot's name (pneumatic-3, ...).  [required]")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Data set to write (HDF5).  [required]")
 @click.option(
     "--samples", default=15000, type=click.IntRange(1), help="Number of control steps, rounded up to whole episodes."
@@ -56,7 +56,7 @@ from modsoft.runtime.files import check_not_input, check_writable
 @click.pass_context
 def cli(
     context: click.Context,
-    robot_file: str | None,
+    file_or_name: str | None,
     out: Path | None,
     samples: int,
     strategy: str,
@@ -79,10 +79,10 @@ def cli(
     """
     if context.invoked_subcommand is not None:
         return
-    if robot_file is None or out is None:
-        raise click.UsageError(f"missing option {'--out' if robot_file else '--robot'}; see --help", context)
-    check_not_input(out, Path(robot_file))
-    robot = robots.load(robot_file)
+    if file_or_name is None or out is None:
+        raise click.UsageError(f"missing option {'--out' if file_or_name else '--robot'}; see --help", context)
+    check_not_input(out, Path(file_or_name))
+    robot = robot_file.load(file_or_name)
     backend_options = dict(_option(text) for text in options)
     from tqdm import tqdm
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import ModelError, ModsoftError
@@ -66,18 +66,18 @@ def write(path: str, run: dict[str, Array]) -> None:
 
 
 @click.command("modsoft-simulate")
-@click.option("--robot", "robot_file", required=True, metavar="FILE|NAME", help="Robot file, or a shipped robot.")
+@click.option("--robot", "file_or_name", required=True, metavar="FILE|NAME", help="Robot file, or a shipped robot.")
 @click.option("--actions", required=True, metavar="FILE", help=".npy array (steps, modules, actions) in [-1, 1].")
 @click.option("--out", required=True, metavar="FILE", help=".npz to write.")
-def command(robot_file: str, actions: str, out: str) -> None:
+def command(file_or_name: str, actions: str, out: str) -> None:
     """Apply a sequence of actions, one in each control period, to the simulated robot from rest.
 
     OUT contains the arrays configuration (steps + 1, modules, 3), that is [v_x, v_y, v_z]; positions (steps + 1,
     modules, 3), m; and directors (steps + 1, modules, 3, 3), rows d1, d2, d3. Row 0 is the robot at rest.
     """
     check_writable(Path(out))
-    check_not_input(Path(out), Path(actions), Path(robot_file))
-    robot = robots.load(robot_file)
+    check_not_input(Path(out), Path(actions), Path(file_or_name))
+    robot = robot_file.load(file_or_name)
     run = simulate(robot, read_actions(actions, robot))
     write(out, run)
     last = np.array2string(run["configuration"][-1], precision=4, suppress_small=True).replace("\n", "")

@@ -9,7 +9,7 @@ from onnx.reference import ReferenceEvaluator
 
 from modsoft.export import load, write
 from modsoft.export.write import export
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.model_file import ACTUATION, FEATURES
 from modsoft.runtime.errors import ModelError
@@ -64,9 +64,9 @@ def test_another_number_of_modules_is_refused(exported, name, modules):
 
 def test_check_refuses_a_robot_of_another_number_of_modules(exported):
     model = Model.load(exported["lstm"][1].path)
-    model.check(robots.load("cable-4"))
+    model.check(robot_file.load("cable-4"))
     with pytest.raises(ModelError, match="trained for modules 4; robot cable-6 has modules 6"):
-        model.check(robots.load("cable-6"))
+        model.check(robot_file.load("cable-6"))
 
 
 @pytest.mark.parametrize("name", FIXED)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from modsoft.export.write import export
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.training import networks
@@ -85,11 +85,11 @@ def test_robot_file_is_relative_to_the_meta_file(tmp_path, monkeypatch, weights)
     here.mkdir()
     monkeypatch.chdir(here)
     torch.save(weights, "w.pt")
-    (here / "own.toml").write_text(robots.text_of("cable-4"))
+    (here / "own.toml").write_text(robot_file.text_of("cable-4"))
     (lab / "meta.toml").write_text(META.replace("pneumatic-3", "own.toml"))
     with pytest.raises(RobotFileError, match=r"meta\.toml: no robot file .*lab/own\.toml, and no shipped robot"):
         export("w.pt", meta=lab / "meta.toml")
-    (lab / "own.toml").write_text(robots.text_of("pneumatic-2"))
+    (lab / "own.toml").write_text(robot_file.text_of("pneumatic-2"))
     assert export("w.pt", meta=lab / "meta.toml").description.modules_trained_on == [2]
 
 

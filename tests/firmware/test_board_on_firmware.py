@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board import codec, protocol
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import Fault, State, VentMode
@@ -123,14 +123,14 @@ def connect(port):
     return Board(port, "virtual", clock=port.clock, threaded=False)
 
 
-ROBOT = robot.load("pneumatic-3")
+ROBOT = robot_file.load("pneumatic-3")
 HALF = np.full(6, 0.2)
 
 
 def changed(old, new):
-    text = robot.text_of("pneumatic-3")
+    text = robot_file.text_of("pneumatic-3")
     assert old in text
-    return robot.parse(text.replace(old, new, 1))
+    return robot_file.parse(text.replace(old, new, 1))
 
 
 def run(board, port, seconds, pressures=HALF, first_tick=1, hz=2.5):
@@ -279,7 +279,7 @@ def test_board_that_does_not_fit_the_robot_file_is_never_armed(rig, old, new, co
 
 def test_cable_robot_has_nothing_to_arm(rig):
     with pytest.raises(RobotFileError, match="expected one: the board drives valves"):
-        rig[0].arm(robot.load("cable-4"))
+        rig[0].arm(robot_file.load("cable-4"))
 
 
 def test_run_continues_after_lost_frames(rig):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from modsoft.hil.plant import ValvesAndArm, duties_from, run, set_points_bar, tool_poses
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.actuation import channel_pressures_bar, pressures_bar
 from modsoft.runtime.control.features import from_directors, from_poses
 
@@ -47,7 +47,7 @@ class RigidArm:
 
 @pytest.fixture
 def robot():
-    return robots.load("pneumatic-3")
+    return robot_file.load("pneumatic-3")
 
 
 def test_the_set_points_undo_what_the_runtime_sends(robot):

@@ -8,7 +8,7 @@ import pytest
 from log_records import tick_record
 
 from modsoft.hil import criteria, record, report
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.log_record import SCHEMA, HeaderRecord, StartRecord, encode
 
 READY = {"event": "ready", "channels": 3, "t_us": 0.0, "mono_ns": 0}
@@ -45,7 +45,7 @@ def run_folder(tmp_path):
             (tmp_path / f"{name}.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
         (tmp_path / "meta.json").write_text(json.dumps({"board": {"slew": slew} if slew else None}))
         (tmp_path / "runtime.err").write_text("one\ntoo late\n")
-        return record.read(tmp_path, tmp_path, robots.load("pneumatic-3"), "down", np.zeros((2, 3, 3)), 79)
+        return record.read(tmp_path, tmp_path, robot_file.load("pneumatic-3"), "down", np.zeros((2, 3, 3)), 79)
 
     return write
 

@@ -10,7 +10,7 @@ from modsoft.hil import report
 from modsoft.hil.criteria import assess
 from modsoft.hil.outputs import ValveOutputs
 from modsoft.hil.record import Record
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import from_angles_deg
 
 
@@ -20,7 +20,7 @@ def record():
     angles = np.linspace(0, 20, ticks)[:, None] * np.array([0.1, -1.0])
     mono = np.arange(ticks) * 400_000_000
     return Record(
-        robot=robots.load("pneumatic-2"),
+        robot=robot_file.load("pneumatic-2"),
         task="down",
         reference=from_angles_deg(angles),
         runtime_exit=0,

@@ -20,7 +20,7 @@ from modsoft.hil.board import emulator
 from modsoft.hil.outputs import emulated_us, read_outputs
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child, Rig
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import angle_between_deg
 from modsoft.runtime.control.tasks import load_task
 from modsoft.runtime.log_reader import Follower, read
@@ -58,7 +58,7 @@ def wait_until(true, timeout_s):
 def run(folder, robot, model, steps):
     """The record of a short run, which meets every criterion but its length."""
     wanted = folder / "down.npy"  # a random controller is not held to the limits of a task's name
-    reference = load_task("down", robots.load(robot))[:steps]
+    reference = load_task("down", robot_file.load(robot))[:steps]
     np.save(wanted, reference)
     with Rig(robot, folder) as rig:
         rig.run(model, str(wanted))
@@ -236,7 +236,7 @@ def tracker(tmp_path_factory):
 
 def broken_robot(folder):
     path = folder / "robot.toml"
-    path.write_text(robots.text_of("pneumatic-3").replace("modules = 3", "moduls = 3"))
+    path.write_text(robot_file.text_of("pneumatic-3").replace("modules = 3", "moduls = 3"))
     return path
 
 

@@ -7,7 +7,7 @@ from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.hil.board.toolchain import missing_packages
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board import connection
 from modsoft.runtime.board.codec import Parser, encode
 from modsoft.runtime.board.protocol import (
@@ -98,10 +98,10 @@ def test_row_23_channels_or_protocol_hash_differ(matrix_row, monkeypatch):
     with EmulatedBoard("simavr", stepped=True) as emulated:
         host = stepped_host(emulated)
         for old, new in MISFITS:
-            text = robots.text_of("pneumatic-3")
+            text = robot_file.text_of("pneumatic-3")
             assert old in text
             with pytest.raises(ProtocolMismatch):
-                host.board.arm(robots.parse(text.replace(old, new, 1)))
+                host.board.arm(robot_file.parse(text.replace(old, new, 1)))
         host.board.close()
         sent = Parser().feed(b"".join(data for _, data in host.port.written))
         assert not [frame for frame in sent if isinstance(frame.message, Arm)]

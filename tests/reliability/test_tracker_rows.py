@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from virtual_loop import PERIOD_S, ROBOT, World, corrupting, planar_poses
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime import safety
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.errors import LostInRun, Tripped
@@ -260,7 +260,7 @@ def test_row_18_hidden_wrong_number_swapped(matrix_row, full):
     rng, tries, worst_s, kinds = np.random.default_rng(18), 10_000 if full else 300, 0.0, set()
     for _ in range(tries):
         name = rng.choice(list(ROBOTS))
-        world = restless(World(steps=20, robot=robots.load(name)))
+        world = restless(World(steps=20, robot=robot_file.load(name)))
         world.frame_age_s = rng.uniform(0.002, 0.045)
         world.angles = tuple(rng.uniform(-1, 1, len(ROBOTS[name])) * ROBOTS[name])
         what, spoil = random_partial(rng, len(ROBOTS[name]) + 1)

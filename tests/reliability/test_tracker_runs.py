@@ -11,7 +11,7 @@ import pytest
 from mega_in_run import side_by_side
 from runtime_in_run import Run, Stand, retry_until_begun
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 
 pytestmark = pytest.mark.realtime
 
@@ -143,7 +143,7 @@ def client_of(process):
 def patient_robot(folder):
     """The shipped robot with a file that allows 8 s without a valid frame."""
     path = folder / "robot.toml"
-    path.write_text(robots.text_of("pneumatic-3").replace("invalid_frames = 3 ", "invalid_frames = 20 "))
+    path.write_text(robot_file.text_of("pneumatic-3").replace("invalid_frames = 3 ", "invalid_frames = 20 "))
     return path
 
 

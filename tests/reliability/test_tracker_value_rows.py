@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from virtual_loop import PERIOD_S, ROBOT, World, corrupting, planar_poses
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime import safety
 from modsoft.runtime.errors import LostInRun, Tripped
 from modsoft.runtime.safety import FrameValidator
@@ -114,7 +114,7 @@ def test_row_36_status_volume_and_rms_error(matrix_row, full):
 def with_invalid_frames(count):
     table = ROBOT.to_dict()
     table["limits"]["invalid_frames"] = count
-    return robots.from_dict(table)
+    return robot_file.from_dict(table)
 
 
 def jumping(rng, robot):

@@ -5,10 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from modsoft.runtime import robot
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control import actuation
 
-ROBOT = robot.load("pneumatic-3")
+ROBOT = robot_file.load("pneumatic-3")
 ACTIONS = arrays(np.float64, (3, 1), elements=st.floats(-1, 1))
 
 
@@ -42,7 +42,7 @@ def test_actuation_within_the_limits_is_unchanged():
 def test_set_points_include_gain_and_offset():
     table = ROBOT.to_dict()
     table["chambers"][0].update(channel=10, gain=0.5, offset_bar=0.01)
-    out = actuation.channel_pressures_bar(robot.from_dict(table), np.array([[1.0], [-1.0], [0.0]]))
+    out = actuation.channel_pressures_bar(robot_file.from_dict(table), np.array([[1.0], [-1.0], [0.0]]))
     expected = np.zeros(12)
     expected[[10, 1, 2, 3, 4, 5]] = [0.5 * 0.35 + 0.01, 0.08, 0.08, 0.35, 0.08, 0.08]
     np.testing.assert_allclose(out, expected)
@@ -52,6 +52,6 @@ def test_set_points_are_limited_to_the_pressure_range():
     table = ROBOT.to_dict()
     table["chambers"][0].update(gain=2.0)
     table["chambers"][1].update(offset_bar=-0.1)
-    out = actuation.channel_pressures_bar(robot.from_dict(table), np.array([[1.0], [0.0], [0.0]]))
+    out = actuation.channel_pressures_bar(robot_file.from_dict(table), np.array([[1.0], [0.0], [0.0]]))
     assert out[0] == 0.35
     assert out[1] == 0.0

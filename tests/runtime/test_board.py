@@ -8,7 +8,7 @@ import threading
 import pytest
 import serial
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board import codec, ports, protocol
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import CHANNELS, PROTOCOL_HASH, Hello, State, Status
@@ -160,7 +160,7 @@ def test_arming_requires_the_requested_session():
     port = ArmedPort()
     board = Board(port, clock=lambda: port.now_s, threaded=False)
     with pytest.raises(Tripped, match="did not arm within 4 s, its state is ARMED"):
-        board.arm(robots.load("pneumatic-3"))
+        board.arm(robot_file.load("pneumatic-3"))
 
 
 # ---- ports

@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import ResetCause, VentMode
 
@@ -21,7 +21,7 @@ from modsoft.hil.board.toolchain import choose, missing_packages
 
 pytestmark = pytest.mark.realtime
 
-ROBOT = robot.load("pneumatic-3")
+ROBOT = robot_file.load("pneumatic-3")
 PERIOD_S = 0.4
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.tracking.sources import port_of
 
 SCRIPT = Path(sys.executable).with_name("modsoft-runtime")
@@ -72,7 +72,7 @@ def test_nothing_heavy_is_imported():
 def test_print_robot_is_a_robot_file(tmp_path):
     done = run("--print-robot", "pneumatic-3")
     (tmp_path / "robot.toml").write_text(done.stdout)
-    assert robots.load(tmp_path / "robot.toml") == robots.load("pneumatic-3")
+    assert robot_file.load(tmp_path / "robot.toml") == robot_file.load("pneumatic-3")
     assert "cable-4" in refused(64, "--print-robot", "octopus")
 
 
@@ -81,7 +81,7 @@ def test_check_robot(tmp_path):
     assert done.returncode == 0
     assert "2 modules, 2.5 Hz" in done.stdout
     assert "full scale 3 bar" in done.stdout
-    (tmp_path / "robot.toml").write_text(robots.text_of("pneumatic-3").replace("modules = 3", "modules = 4"))
+    (tmp_path / "robot.toml").write_text(robot_file.text_of("pneumatic-3").replace("modules = 3", "modules = 4"))
     assert "chambers" in refused(64, "--check", tmp_path / "robot.toml")
 
 
@@ -92,7 +92,7 @@ def test_check_tells_what_is_still_to_fill_in(tmp_path):
         "port under [serial], or --port"
     )
     path = tmp_path / "robot.toml"
-    text = robots.text_of("pneumatic-3").replace('port = ""', 'port = "/dev/null"')
+    text = robot_file.text_of("pneumatic-3").replace('port = ""', 'port = "/dev/null"')
     path.write_text(text.replace('task = "down"', 'task = ""').replace("tools = []", 'tools = ["0", "1", "2", "3"]'))
     for tool in "013":
         (tmp_path / tool).touch()
@@ -106,7 +106,7 @@ def test_check_tells_what_is_still_to_fill_in(tmp_path):
 @pytest.mark.parametrize(("task", "expected"), [("up", "edge, down"), ("none.npy", "no task file")])
 def test_check_proves_the_task(tmp_path, task, expected):
     path = tmp_path / "robot.toml"
-    path.write_text(robots.text_of("pneumatic-3").replace('task = "down"', f'task = "{task}"'))
+    path.write_text(robot_file.text_of("pneumatic-3").replace('task = "down"', f'task = "{task}"'))
     line = refused(64, "--check", path, cwd=tmp_path)
     assert "task under [loop]" in line
     assert expected in line
@@ -119,7 +119,7 @@ def test_the_task_of_a_robot_file_is_beside_it(tmp_path, model_file, folder):
     lab.mkdir()
     for path, steps in ((lab / "t.npy", 10), (tmp_path / "t.npy", 7)):
         np.save(path, np.tile([0.0, 0.0, 1.0], (steps, 3, 1)))
-    text = robots.text_of("pneumatic-3").replace('task = "down"', 'task = "t.npy"')
+    text = robot_file.text_of("pneumatic-3").replace('task = "down"', 'task = "t.npy"')
     (lab / "robot.toml").write_text(text)
     (tmp_path / "robot.toml").write_text(text)
     lines = run("--check", f"{folder}/robot.toml", cwd=tmp_path).stdout.splitlines()
@@ -135,10 +135,10 @@ def test_the_task_of_a_robot_file_is_beside_it(tmp_path, model_file, folder):
 def test_a_recorded_run_in_a_robot_file_is_beside_it(tmp_path):
     lab = tmp_path / "lab"
     (lab / "run").mkdir(parents=True)
-    text = robots.text_of("pneumatic-3").replace('source = "ndi"', 'source = "replay"')
+    text = robot_file.text_of("pneumatic-3").replace('source = "ndi"', 'source = "replay"')
     (lab / "robot.toml").write_text(text.replace('port = ""                    # such', 'port = "run"  # such'))
-    robot = robots.load(lab / "robot.toml")
-    assert port_of(robot, robots.folder_of(lab / "robot.toml")) == str(lab / "run")
+    robot = robot_file.load(lab / "robot.toml")
+    assert port_of(robot, robot_file.folder_of(lab / "robot.toml")) == str(lab / "run")
     assert "not there" not in run("--check", "lab/robot.toml", cwd=tmp_path).stdout
     (lab / "run").rmdir()
     assert "lab/run, which is not there" in run("--check", "lab/robot.toml", cwd=tmp_path).stdout
@@ -174,7 +174,7 @@ def test_no_robot_file_here(tmp_path):
 
 def test_a_wrong_robot_file(tmp_path, port):
     path = tmp_path / "robot.toml"
-    path.write_text(robots.text_of("pneumatic-3").replace("full_scale_bar = 3.0", "full_scale = 3.0"))
+    path.write_text(robot_file.text_of("pneumatic-3").replace("full_scale_bar = 3.0", "full_scale = 3.0"))
     assert "full_scale" in refused(64, "--port", port, cwd=tmp_path)
 
 
@@ -208,7 +208,7 @@ def test_a_damaged_model(tmp_path, port, model_file):
 
 
 def test_no_task(tmp_path, port, model_file):
-    (tmp_path / "robot.toml").write_text(robots.text_of("pneumatic-3").replace('task = "down"', 'task = ""'))
+    (tmp_path / "robot.toml").write_text(robot_file.text_of("pneumatic-3").replace('task = "down"', 'task = ""'))
     assert "--task" in refused(2, "--port", port, "--model", model_file, cwd=tmp_path)
     assert "edge, down" in refused(2, "--port", port, "--model", model_file, "--task", "up", cwd=tmp_path)
 
@@ -248,7 +248,7 @@ def test_a_folder_for_a_tool(tmp_path, port, model_file, tools):
 def test_tools_of_a_robot_file_lie_beside_it(tmp_path, port, model_file):
     (tmp_path / "arm").mkdir()
     names = '["base.rom", "1.rom", "2.rom", "3.rom"]'
-    text = robots.text_of("pneumatic-3").replace("tools = []", f"tools = {names}")
+    text = robot_file.text_of("pneumatic-3").replace("tools = []", f"tools = {names}")
     (tmp_path / "arm" / "robot.toml").write_text(text)
     told = ["--robot", "arm/robot.toml", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
     assert os.path.join("arm", "base.rom") in refused(69, *told, cwd=tmp_path)

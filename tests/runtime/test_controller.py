@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.controller import Controller
 from modsoft.runtime.control.correction import NoCorrection
 from modsoft.runtime.control.features import Window, from_angles_deg, state_of
 from modsoft.runtime.errors import ModelError
 
-TABLE = robots.load("pneumatic-3").to_dict()
+TABLE = robot_file.load("pneumatic-3").to_dict()
 TABLE["limits"]["largest_actuation_step"] = 0.8
-ROBOT = robots.from_dict(TABLE)
+ROBOT = robot_file.from_dict(TABLE)
 REST = from_angles_deg(np.zeros(3))
 NEXT = from_angles_deg(np.array([5.0, 10.0, -20.0]))
 

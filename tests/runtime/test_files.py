@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import ModelError, OutputError, RobotFileError, UsageError
 from modsoft.runtime.files import check_not_input, check_writable, make_folder, read_text, written
 
@@ -164,8 +164,8 @@ def test_text_with_a_byte_order_mark_is_read(tmp_path, encoding):
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_robot_file_is_read_in_every_encoding(tmp_path, encoding):
     path = tmp_path / "robot.toml"
-    path.write_bytes(encoded(robots.text_of("pneumatic-3"), encoding))
-    assert robots.load(path) == robots.load("pneumatic-3")
+    path.write_bytes(encoded(robot_file.text_of("pneumatic-3"), encoding))
+    assert robot_file.load(path) == robot_file.load("pneumatic-3")
 
 
 @pytest.mark.parametrize(
@@ -180,6 +180,6 @@ def test_robot_file_is_read_in_every_encoding(tmp_path, encoding):
 def test_binary_file_is_refused(tmp_path, content, found):
     path = tmp_path / "robot.toml"
     path.write_bytes(content)
-    for read, error in ((read_text, ModelError), (robots.load, RobotFileError)):
+    for read, error in ((read_text, ModelError), (robot_file.load, RobotFileError)):
         with pytest.raises(error, match=rf"^[^\n]*robot\.toml: [^\n]*{found}[^\n]*$"):
             read(path)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from virtual_loop import PERIOD_S, ROBOT, World
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.dry_run import DryRunBoard
 from modsoft.runtime.board.protocol import CHANNELS
 from modsoft.runtime.control.actuation import channel_pressures_bar
@@ -333,7 +333,7 @@ def test_set_points_are_never_less_than_half_a_period_apart(stalls, works):
 
 
 def test_two_modules_run_with_the_same_loop():
-    world = World(steps=5, robot=robots.load("pneumatic-2"))
+    world = World(steps=5, robot=robot_file.load("pneumatic-2"))
     world.run()
     assert world.features[0].shape == (2, 3 * 3 + 1)
     assert len(world.ticks) == 5

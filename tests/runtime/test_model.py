@@ -8,7 +8,7 @@ import onnx
 import pytest
 from corrupted_models import onnx_description, with_description_changed
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control import features as feature_layout
 from modsoft.runtime.control import model_file as model_files
 from modsoft.runtime.control.model import Model, open_unit
@@ -41,7 +41,7 @@ def test_same_features_same_actuation(model, model_file):
 
 
 def test_model_accepts_the_features_of_the_window(model):
-    robot = robots.load("pneumatic-2")
+    robot = robot_file.load("pneumatic-2")
     model.check(robot)
     model.warm_up(robot.modules)
     rest = np.zeros((2, 2))
@@ -74,11 +74,11 @@ def test_wrong_shapes_are_refused(model, shape):
 
 
 def test_check_names_the_differences(model):
-    model.check(robots.load("pneumatic-3"))
+    model.check(robot_file.load("pneumatic-3"))
     with pytest.raises(ModelError, match=r"kind pneumatic, state size 2, action size 1, .*cable-4 has kind cable"):
-        model.check(robots.load("cable-4"))
-    text = robots.text_of("pneumatic-3")
-    slow = robots.parse(text.replace("hz = 2.5", "hz = 2.0"))
+        model.check(robot_file.load("cable-4"))
+    text = robot_file.text_of("pneumatic-3")
+    slow = robot_file.parse(text.replace("hz = 2.5", "hz = 2.0"))
     assert slow.loop.period_s == 0.5
     with pytest.raises(ModelError, match=r"trained for period_s 0\.4; robot pneumatic-3 has period_s 0\.5"):
         model.check(slow)

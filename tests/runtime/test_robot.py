@@ -5,7 +5,7 @@ import dataclasses
 import msgspec
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import RobotFileError
 
 
@@ -19,54 +19,54 @@ from modsoft.runtime.errors import RobotFileError
     ],
 )
 def test_shipped_robots(name, kind, modules, state, action):
-    robot = robots.load(name)
+    robot = robot_file.load(name)
     assert (robot.name, robot.kind, robot.modules) == (name, kind, modules)
     assert (robot.state_size, robot.action_size) == (state, action)
 
 
 def test_names_of_shipped_robots():
-    assert robots.names() == ["cable-4", "cable-6", "pneumatic-2", "pneumatic-3"]
+    assert robot_file.names() == ["cable-4", "cable-6", "pneumatic-2", "pneumatic-3"]
 
 
 @pytest.mark.parametrize("modules", [2, 3, 5, 8, 12, 64])
 def test_cable_robot_exists_for_any_number_of_modules(modules):
     name = f"cable-{modules}"
-    expected = robots.load("cable-4").to_dict()
+    expected = robot_file.load("cable-4").to_dict()
     expected["robot"] |= {"name": name, "modules": modules}
-    assert robots.load(name).to_dict() == expected
-    assert f"robot of {modules} modules" in robots.text_of(name)
+    assert robot_file.load(name).to_dict() == expected
+    assert f"robot of {modules} modules" in robot_file.text_of(name)
 
 
 @pytest.mark.parametrize("name", ["cable-1", "cable-65", "cable-0", "cable-", "cable-05", "pneumatic-4"])
 def test_robot_with_an_invalid_number_of_modules_is_refused(name):
     with pytest.raises(RobotFileError, match=name):
-        robots.load(name)
+        robot_file.load(name)
 
 
 def test_text_of_a_shipped_robot_is_a_robot_file(tmp_path):
     path = tmp_path / "robot.toml"
-    path.write_text(robots.text_of("pneumatic-3"))
-    assert robots.load(path) == robots.load("pneumatic-3")
+    path.write_text(robot_file.text_of("pneumatic-3"))
+    assert robot_file.load(path) == robot_file.load("pneumatic-3")
 
 
 def test_file_takes_precedence_over_a_shipped_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "cable-4").write_text(robots.text_of("cable-6"))
-    assert robots.load("cable-4").modules == 6
+    (tmp_path / "cable-4").write_text(robot_file.text_of("cable-6"))
+    assert robot_file.load("cable-4").modules == 6
 
 
 def test_dict_round_trip():
-    for name in robots.names():
-        robot = robots.load(name)
-        assert robots.from_dict(robot.to_dict()) == robot
+    for name in robot_file.names():
+        robot = robot_file.load(name)
+        assert robot_file.from_dict(robot.to_dict()) == robot
 
 
 def test_robot_is_frozen():
     with pytest.raises((AttributeError, dataclasses.FrozenInstanceError)):
-        robots.load("cable-4").loop.hz = 3.0
+        robot_file.load("cable-4").loop.hz = 3.0
 
 
-PNEUMATIC = robots.text_of("pneumatic-3")
+PNEUMATIC = robot_file.text_of("pneumatic-3")
 
 
 @pytest.mark.parametrize(
@@ -109,13 +109,16 @@ PNEUMATIC = robots.text_of("pneumatic-3")
         (PNEUMATIC.replace("tools = []", 'tools = ["a.rom"]'), "4: base, then modules 1 to 3"),
         (PNEUMATIC.replace("[robot]", "[robot"), "not valid TOML"),
         (PNEUMATIC + '\n[colour]\npaint = "red"\n', "colour"),
-        (robots.text_of("cable-4") + '\n[valve]\nmodel = "x"\nfull_scale_bar = 3.0\nsignal = "0-10 V"\n', "simulated"),
-        (robots.text_of("cable-4").replace('"cable"', '"pneumatic"'), "full_scale_bar"),
+        (
+            robot_file.text_of("cable-4") + '\n[valve]\nmodel = "x"\nfull_scale_bar = 3.0\nsignal = "0-10 V"\n',
+            "simulated",
+        ),
+        (robot_file.text_of("cable-4").replace('"cable"', '"pneumatic"'), "full_scale_bar"),
     ],
 )
 def test_every_error_is_one_line_that_names_the_key(text, expected):
     with pytest.raises(RobotFileError, match=expected) as caught:
-        robots.parse(text, "robot.toml")
+        robot_file.parse(text, "robot.toml")
     assert str(caught.value).startswith("robot.toml: ")
     assert "\n" not in str(caught.value)
 
@@ -123,19 +126,19 @@ def test_every_error_is_one_line_that_names_the_key(text, expected):
 def test_unknown_name_lists_the_shipped_robots(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RobotFileError, match="pneumatic-2, pneumatic-3"):
-        robots.load("octopus")
+        robot_file.load("octopus")
 
 
 def test_folder_is_refused(tmp_path):
     with pytest.raises(RobotFileError, match="is a folder, expected a robot file"):
-        robots.load(tmp_path)
+        robot_file.load(tmp_path)
 
 
 def test_binary_file_is_refused(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RobotFileError, match="UTF-8"):
-        robots.load(path)
+        robot_file.load(path)
 
 
 def test_every_section_refuses_unknown_keys():
@@ -146,4 +149,4 @@ def test_every_section_refuses_unknown_keys():
                 if isinstance(inner, type) and issubclass(inner, msgspec.Struct):
                     yield from sections(inner)
 
-    assert {kind.__struct_config__.forbid_unknown_fields for kind in sections(robots.Robot)} == {True}
+    assert {kind.__struct_config__.forbid_unknown_fields for kind in sections(robot_file.Robot)} == {True}

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime import safety
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
@@ -122,7 +122,7 @@ def test_frame_without_quality_and_status_is_valid():
 def with_limits(**limits):
     table = ROBOT.to_dict()
     table["limits"].update(limits)
-    return robots.from_dict(table)
+    return robot_file.from_dict(table)
 
 
 def test_jump_that_stays_is_accepted_after_three_confirming_frames():
@@ -168,7 +168,7 @@ def test_a_gap_allows_no_larger_jump():
 def test_no_limits_in_the_robot_file_give_a_gate():
     table = ROBOT.to_dict()
     del table["limits"]
-    judge = FrameValidator(robots.from_dict(table))
+    judge = FrameValidator(robot_file.from_dict(table))
     assert judge.judge(frame(6000, 100.0), 100.02).good
     assert judge.judge(frame(6024, 100.4, (0.0, 0.0, 90.0)), 100.42).word == safety.JUMP
 

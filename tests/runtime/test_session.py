@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime import session, shutdown
 from modsoft.runtime.board.protocol import VentMode
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped, UsageError
@@ -14,7 +14,7 @@ from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Interrupted, Stop, StopKey
 from modsoft.runtime.tracking.frame import LatestFrame
 
-ROBOT = robots.load("pneumatic-3")
+ROBOT = robot_file.load("pneumatic-3")
 
 
 class Board:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control import features, task_tables, tasks
 from modsoft.runtime.errors import UsageError
 
@@ -90,47 +90,47 @@ def test_down_is_the_triangle_of_s5(modules, largest):
 
 def test_unknown_task_is_refused_with_the_names():
     with pytest.raises(UsageError, match=r"expected edge, down, or a \.npy file"):
-        tasks.load_task("sideways", robot.load("pneumatic-3"))
+        tasks.load_task("sideways", robot_file.load("pneumatic-3"))
 
 
 def test_task_is_loaded_from_a_file(tmp_path):
     path = tmp_path / "task.npy"
     np.save(path, tasks.task("edge", "pneumatic", 2))
-    loaded = tasks.load_task(str(path), robot.load("pneumatic-2"))
+    loaded = tasks.load_task(str(path), robot_file.load("pneumatic-2"))
     assert np.array_equal(loaded, tasks.task("edge", "pneumatic", 2))
     with pytest.raises(UsageError, match=r"expected \(steps, 3, 3\)"):
-        tasks.load_task(str(path), robot.load("pneumatic-3"))
+        tasks.load_task(str(path), robot_file.load("pneumatic-3"))
 
 
 @pytest.mark.parametrize("content", [np.zeros((5, 2, 3)), np.ones((5, 2, 3), dtype=int), np.full((5, 2, 3), np.nan)])
 def test_task_file_without_unit_vectors_is_refused(tmp_path, content):
     np.save(tmp_path / "task.npy", content)
     with pytest.raises(UsageError, match="unit vector"):
-        tasks.load_task(str(tmp_path / "task.npy"), robot.load("pneumatic-2"))
+        tasks.load_task(str(tmp_path / "task.npy"), robot_file.load("pneumatic-2"))
 
 
 def test_missing_or_damaged_task_file_is_refused(tmp_path):
     with pytest.raises(UsageError, match="no task file"):
-        tasks.load_task(str(tmp_path / "none.npy"), robot.load("pneumatic-2"))
+        tasks.load_task(str(tmp_path / "none.npy"), robot_file.load("pneumatic-2"))
     (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY broken")
     with pytest.raises(UsageError, match="not a readable"):
-        tasks.load_task(str(tmp_path / "bad.npy"), robot.load("pneumatic-2"))
+        tasks.load_task(str(tmp_path / "bad.npy"), robot_file.load("pneumatic-2"))
     np.save(tmp_path / "objects.npy", np.array([None]), allow_pickle=True)
     (tmp_path / "empty.npy").write_bytes(b"")
     for name in ("bad.npy", "objects.npy", "empty.npy"):
         with pytest.raises(UsageError, match=r"not a readable .* numpy\.save") as caught:
-            tasks.load_task(str(tmp_path / name), robot.load("pneumatic-2"))
+            tasks.load_task(str(tmp_path / name), robot_file.load("pneumatic-2"))
         assert "pickle" not in str(caught.value)
     (tmp_path / "folder.npy").mkdir()
     with pytest.raises(UsageError, match="is a folder"):
-        tasks.load_task(str(tmp_path / "folder.npy"), robot.load("pneumatic-2"))
+        tasks.load_task(str(tmp_path / "folder.npy"), robot_file.load("pneumatic-2"))
 
 
 def test_empty_task_file_and_archive_are_refused(tmp_path):
     np.save(tmp_path / "none.npy", np.zeros((0, 2, 3)))
     with pytest.raises(UsageError, match="found 0 steps, expected at least 1"):
-        tasks.load_task(str(tmp_path / "none.npy"), robot.load("pneumatic-2"))
+        tasks.load_task(str(tmp_path / "none.npy"), robot_file.load("pneumatic-2"))
     with (tmp_path / "many.npy").open("wb") as file:
         np.savez(file, a=np.zeros((1, 2, 3)))
     with pytest.raises(UsageError, match="archive of arrays"):
-        tasks.load_task(str(tmp_path / "many.npy"), robot.load("pneumatic-2"))
+        tasks.load_task(str(tmp_path / "many.npy"), robot_file.load("pneumatic-2"))

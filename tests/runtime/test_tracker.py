@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.tracking import ndi
 from modsoft.runtime.tracking.frame import FrameError, LatestFrame, TrackerFrame
@@ -17,7 +17,7 @@ from modsoft.runtime.tracking.reader import Reader
 from modsoft.runtime.tracking.replay import Replay
 from modsoft.runtime.tracking.sources import open_source
 
-ROBOT = robots.load("pneumatic-3")
+ROBOT = robot_file.load("pneumatic-3")
 
 
 def frame(number: int, at_s: float = 0.0, tools: int = 4) -> TrackerFrame:
@@ -167,7 +167,7 @@ def test_replay_of_nothing(tmp_path):
 def with_tracker(**changes):
     table = ROBOT.to_dict()
     table["tracker"].update(changes)
-    return robots.from_dict(table)
+    return robot_file.from_dict(table)
 
 
 def test_what_was_not_told_is_named(tmp_path):

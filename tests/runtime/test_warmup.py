@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from virtual_loop import PERIOD_S, ROBOT, World, corrupting
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.clock import SPIN_S
 from modsoft.runtime.control.controller import Controller
 from modsoft.runtime.control.features import from_angles_deg
@@ -94,7 +94,7 @@ def test_it_changes_neither_the_validator_nor_the_controller():
 def test_without_enough_time_it_never_runs(step_s, period_s):
     table = ROBOT.to_dict()
     table["loop"] |= {"hz": 1.0 / period_s, "task": ""}
-    world = Warmed(robot=robots.from_dict(table))
+    world = Warmed(robot=robot_file.from_dict(table))
     world.warm_up.step_took(step_s)
     for left_s in np.linspace(0.0001, period_s, 50):
         assert world.warm_up.before(left_s, world.frame(), world.controller) == left_s

@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.tasks import load_task
 from modsoft.runtime.errors import UsageError
 from modsoft.training import collect_cli, simulate_cli, train_cli
@@ -14,7 +14,7 @@ from modsoft.training.data import dataset
 @pytest.fixture
 def data_file(tmp_path):
     """A small valid data set."""
-    robot = robots.load("pneumatic-2")
+    robot = robot_file.load("pneumatic-2")
     generation = {"robot": robot.to_dict(), "strategy": "random", "steps": 3}
     configuration = np.tile([0.0, 0.0, 1.0], (2, 4, 2, 1))
     path = tmp_path / "data.h5"
@@ -123,7 +123,7 @@ def test_arrays_with_claimed_sizes_are_refused(tmp_path, content, ended):
     code, lines = ended(simulate_cli.main, "--robot", "pneumatic-2", "--actions", path, "--out", tmp_path / "o")
     assert (code, len(lines)) == (65, 1)
     with pytest.raises(UsageError, match=r"^task file [^\n]*: not a readable .npy array"):
-        load_task(str(path), robots.load("pneumatic-2"))
+        load_task(str(path), robot_file.load("pneumatic-2"))
 
 
 def test_pickled_actions_are_refused(tmp_path, harm, evil, ended):

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import InUse, OutputError
 from modsoft.training.data import collect, dataset
 from modsoft.training.data.episode_store import Shards
 from modsoft.training.simulation.simulators import Simulator
 
-ROBOT = robots.load("pneumatic-2")
+ROBOT = robot_file.load("pneumatic-2")
 
 
 def still(robot, actions):

@@ -10,7 +10,7 @@ import pytest
 from processes import descendants
 
 from modsoft.hil.rig import Rig
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 
 LISTENING = "0A"
 # As the kernel writes 127.0.0.1, ::1 and ::ffff:127.0.0.1.
@@ -54,7 +54,7 @@ def test_public_port_is_detected():
 def test_run_on_the_rig_listens_on_loopback_only(tracker, ports, tmp_path, model_file):
     """A vega is a network device, and so is its emulation."""
     robot = tmp_path / "robot.toml"
-    robot.write_text(robots.text_of("pneumatic-3").replace('type = "polaris"', f'type = "{tracker}"'))
+    robot.write_text(robot_file.text_of("pneumatic-3").replace('type = "polaris"', f'type = "{tracker}"'))
     with Rig(robot, tmp_path / "out", board="native") as rig:
         rig.run(model_file, "down")
         deadline_s = time.monotonic() + 60

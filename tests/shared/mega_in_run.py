@@ -14,7 +14,7 @@ import numpy as np
 from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.ports import open_port
 from modsoft.runtime.board.protocol import State
@@ -30,7 +30,7 @@ class Host:
 
     BAR = 0.35  # the limit of the shipped robot: the longest ramp
     PERIOD_S = 0.4
-    ROBOT = robots.load("pneumatic-3")
+    ROBOT = robot_file.load("pneumatic-3")
 
     def __init__(self, port, threaded=True, clock=time.monotonic):
         self.port, self.threaded, self.clock = port, threaded, clock

@@ -4,7 +4,7 @@ import numpy as np
 
 from modsoft.hil.outputs import ValveOutputs
 from modsoft.hil.record import Record
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.actuation import channel_pressures_bar
 from modsoft.runtime.control.features import from_angles_deg
 
@@ -12,7 +12,7 @@ TICKS = 120
 PERIOD_NS = 400_000_000
 START_NS = 5_000_000_000
 COUNTS = 4096
-ROBOT = robots.load("pneumatic-3")
+ROBOT = robot_file.load("pneumatic-3")
 
 
 def slewed(start, commanded):

@@ -1,9 +1,9 @@
 """Robots of any kind and number of modules, without a robot file."""
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 
 
-def of_modules(kind: str, modules: int, largest: float = 2.0) -> robots.Robot:
+def of_modules(kind: str, modules: int, largest: float = 2.0) -> robot_file.Robot:
     table = {
         "robot": {"name": "r", "kind": kind, "modules": modules},
         "loop": {"hz": 2.5},
@@ -13,4 +13,4 @@ def of_modules(kind: str, modules: int, largest: float = 2.0) -> robots.Robot:
         table["valve"] = {"model": "v", "full_scale_bar": 1.0, "signal": "0-10 V"}
         sides = [(m, s) for m in range(1, modules + 1) for s in "+-"]
         table["chambers"] = [{"module": m, "side": s, "channel": i} for i, (m, s) in enumerate(sides)]
-    return robots.from_dict(table)
+    return robot_file.from_dict(table)

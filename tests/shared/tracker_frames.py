@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from virtual_loop import ROBOT, planar_poses
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.tracking.frame import TrackerFrame
 
@@ -21,4 +21,4 @@ def with_limits(**limits) -> Robot:
     """pneumatic-3 with these limits."""
     table = ROBOT.to_dict()
     table["limits"].update(limits)
-    return robots.from_dict(table)
+    return robot_file.from_dict(table)

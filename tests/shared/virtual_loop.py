@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.protocol import CHANNELS, State
 from modsoft.runtime.clock import Ticker
 from modsoft.runtime.control.features import from_angles_deg
@@ -21,7 +21,7 @@ from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Stop
 from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 
-ROBOT = robots.load("pneumatic-3")
+ROBOT = robot_file.load("pneumatic-3")
 PERIOD_S = ROBOT.loop.period_s
 MODULE_MM = 85.0
 START_S = 500.0

@@ -18,7 +18,7 @@ STAND_IN = """
     import os, signal
     from pathlib import Path
     import numpy as np
-    from modsoft.runtime import robot as robots
+    from modsoft.runtime import robot as robot_file
     from modsoft.runtime.control.features import from_angles_deg
     from modsoft.runtime.errors import ModelError
     from modsoft.training.data import backends
@@ -43,7 +43,7 @@ STAND_IN = """
 
     def main(out, backend, mode="", *options):
         backends.SHOWN_S = backends.LOOK_S = 0.1
-        robot = robots.load("pneumatic-3")
+        robot = robot_file.load("pneumatic-3")
         rng = np.random.default_rng(np.random.SeedSequence(3, spawn_key=(2, 0)))
         actions = draw_actions(robot, "staged", 30, rng)
         simulator = Simulator("stand-in", StandIn(mode, actions, Path("died").absolute()), 2)

@@ -6,7 +6,7 @@ import benchmarks
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.training.data import dataset
 
 
@@ -18,7 +18,7 @@ def bench():
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     """Modules whose configuration is proportional to their last action: easy to learn."""
-    robot = robots.load("cable-4")
+    robot = robot_file.load("cable-4")
     action = np.random.default_rng(0).uniform(-1, 1, (6, 60, 4, 2))
     configuration = np.zeros((6, 61, 4, 3))
     configuration[:, 1:, :, :2] = 0.5 * action

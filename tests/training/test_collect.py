@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_robots import of_modules
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.training.data import collect as c
@@ -223,7 +223,7 @@ SCRIPT = """
     import os, sys, time
     from pathlib import Path
     import stand_in
-    from modsoft.runtime import robot as robots
+    from modsoft.runtime import robot as robot_file
     from modsoft.training.data.collect import collect
     from modsoft.training.simulation.simulators import Simulator
 
@@ -237,7 +237,7 @@ SCRIPT = """
             return stand_in.simulate(robot, actions)
 
     if __name__ == "__main__":
-        collect(robots.load("pneumatic-3"), Path("d.h5"), 360, "staged", 5, 30, jobs=int(sys.argv[1]),
+        collect(robot_file.load("pneumatic-3"), Path("d.h5"), 360, "staged", 5, 30, jobs=int(sys.argv[1]),
                 simulator=Simulator("stand-in", Slow(float(sys.argv[2])), batch_size=2))
         print("done", flush=True)
 """
@@ -298,12 +298,12 @@ MEMORY = """
     import resource, sys
     from pathlib import Path
     import stand_in
-    from modsoft.runtime import robot as robots
+    from modsoft.runtime import robot as robot_file
     from modsoft.training.data.collect import collect
     from modsoft.training.simulation.simulators import Simulator
 
     simulator = Simulator("stand-in", stand_in.simulate, 8)
-    collect(robots.load("cable-4"), Path("d.h5"), int(sys.argv[1]), simulator=simulator)
+    collect(robot_file.load("cable-4"), Path("d.h5"), int(sys.argv[1]), simulator=simulator)
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 """
 
@@ -323,7 +323,7 @@ def test_memory_does_not_grow_with_the_number_of_samples(tmp_path):
 
 
 def test_varied_data_have_another_perturbed_robot_every_eight_episodes():
-    robot = robots.load("cable-4")
+    robot = robot_file.load("cable-4")
     generation = c.generation_settings(robot, "varied", 5, 30, "stand-in")
     found = [c.perturbation_of(generation, robot, index) for index in range(400)]
     assert len(set(found)) == 50
@@ -340,7 +340,7 @@ def test_varied_data_have_another_perturbed_robot_every_eight_episodes():
 
 
 def test_episode_is_simulated_on_its_own_robot_in_any_batch():
-    robot = robots.load("cable-4")
+    robot = robot_file.load("cable-4")
     generation = c.generation_settings(robot, "varied", 5, 6, "stand-in")
 
     def stiff(robot, actions, *, perturbation):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import ModelError, OutputError, UsageError
 from modsoft.training.data import actions, coverage, dataset
@@ -38,7 +38,7 @@ def test_module_is_rotated_with_the_previous_one():
 
 @pytest.mark.parametrize(("name", "farthest_m"), [("pneumatic-3", 0.010), ("cable-4", 0.030)])
 def test_arcs_are_close_to_the_simulated_robot(name, farthest_m):
-    robot = robots.load(name)
+    robot = robot_file.load(name)
     arm = Arm(robot.kind, robot.modules)
     arm.step(np.full((robot.modules, robot.action_size), 0.4), 0.4)
     ends = coverage.module_ends(arm.configuration, arm.parameters.module_length_m)
@@ -57,7 +57,7 @@ def test_covered_space_counts_every_cell_once():
 
 def write(path, name: str, strategy: str, episodes: int = 20, steps: int = 150) -> None:
     """A data set whose modules take the direction of their action at once."""
-    robot = robots.load(name)
+    robot = robot_file.load(name)
     rng = np.random.default_rng(0)
     action = np.stack([actions.draw_actions(robot, strategy, steps, rng) for _ in range(episodes)])
     across = np.zeros((episodes, steps + 1, robot.modules, 2))

@@ -4,14 +4,14 @@ import h5py
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import Window, from_angles_deg, state_of
 from modsoft.runtime.errors import ModelError
 from modsoft.training.data import dataset as d
 
 
 def make(episodes: int, steps: int, kind: str = "pneumatic-3", stages: int = 3, seed: int = 0) -> d.DataSet:
-    robot = robots.load(kind)
+    robot = robot_file.load(kind)
     rng = np.random.default_rng(seed)
     angles = rng.uniform(-90, 90, (episodes, steps + 1, robot.modules))
     angles[:, 0] = 0.0

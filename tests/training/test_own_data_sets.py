@@ -7,13 +7,13 @@ import h5py
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import ModelError
 from modsoft.training import collect_cli, train_cli
 from modsoft.training.data import dataset
 
 E, K, N = 2, 12, 3
-GENERATION = {"robot": robots.load("pneumatic-3").to_dict(), "strategy": "real robot"}
+GENERATION = {"robot": robot_file.load("pneumatic-3").to_dict(), "strategy": "real robot"}
 ANGLES = np.concatenate([np.zeros((E, 1, N)), np.random.default_rng(0).uniform(-0.5, 0.5, (E, K, N))], axis=1)
 ACTION = 2.0 * ANGLES[:, 1:, :, None]
 CONFIGURATION = np.stack([np.sin(ANGLES), 0.0 * ANGLES, np.cos(ANGLES)], axis=-1)
@@ -122,7 +122,7 @@ INVALID = {
         "robot of its generation settings cannot be read",
     ),
     "another robot": (
-        {"generation": {**GENERATION, "robot": robots.load("cable-4").to_dict()}},
+        {"generation": {**GENERATION, "robot": robot_file.load("cable-4").to_dict()}},
         r"expected \(2, 12, 4, 2\) for",
     ),
     "other steps": (

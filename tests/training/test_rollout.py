@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control import correction, tasks
 from modsoft.runtime.control.features import bending_angle_deg, feature_names, from_angles_deg, state_of
 from modsoft.runtime.errors import ModelError
@@ -13,7 +13,7 @@ from modsoft.training.simulation.rollout import ControllerSetup, rollout
 pytestmark = pytest.mark.instructions
 
 FULL_DEG = 100.0
-PNEUMATIC_2, PNEUMATIC_3 = robots.load("pneumatic-2"), robots.load("pneumatic-3")
+PNEUMATIC_2, PNEUMATIC_3 = robot_file.load("pneumatic-2"), robot_file.load("pneumatic-3")
 
 
 class RobotsOfAngles:

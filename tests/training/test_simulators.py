@@ -8,7 +8,7 @@ import benchmarks
 import numpy as np
 import pytest
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import ModsoftError, RobotFileError, UsageError
 from modsoft.training.data import collect, dataset
 from modsoft.training.data.actions import draw_actions
@@ -20,8 +20,8 @@ pytestmark = pytest.mark.instructions
 needs_fleet = pytest.mark.skipif(not fleet_kernel.variants(), reason="the fleet's kernel is not built here")
 
 
-def draw(name: str, count: int, steps: int) -> tuple[robots.Robot, np.ndarray]:
-    robot = robots.load(name)
+def draw(name: str, count: int, steps: int) -> tuple[robot_file.Robot, np.ndarray]:
+    robot = robot_file.load(name)
     rng = np.random.default_rng(3)
     return robot, np.stack([draw_actions(robot, "random", steps, rng) for _ in range(count)])
 
@@ -75,7 +75,7 @@ def test_diverged_robot_of_the_fleet_is_rejected_and_replaced(tmp_path, monkeypa
             planted.append(self)
             self._state[victim // self.lanes, 2, 3, victim % self.lanes] = np.nan  # a velocity
 
-    robot = robots.load("pneumatic-2")
+    robot = robot_file.load("pneumatic-2")
     made = {}
     for name in ("clean", "planted"):
         if name == "planted":
@@ -94,7 +94,7 @@ def test_diverged_robot_of_the_fleet_is_rejected_and_replaced(tmp_path, monkeypa
 
 
 def test_simulators_are_selected_by_name():
-    robot = robots.load("pneumatic-2")
+    robot = robot_file.load("pneumatic-2")
     assert simulators.names()[-1] == "elastica"
     assert simulators.fastest(robot).name == simulators.names()[0]
     assert simulators.by_name("elastica", robot).simulate is simulators.by_elastica
@@ -118,10 +118,10 @@ def test_named_variant_gives_the_same_bits():
     ],
 )
 def test_unsuitable_robots_are_refused(section, key, value, message):
-    table = robots.load("pneumatic-3").to_dict()
+    table = robot_file.load("pneumatic-3").to_dict()
     table[section] = {**table[section], key: value}
     with pytest.raises(RobotFileError, match=message):
-        simulators.fastest(robots.from_dict(table))
+        simulators.fastest(robot_file.from_dict(table))
 
 
 def command(*arguments: str) -> list[str]:

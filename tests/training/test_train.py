@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import feature_names, from_angles_deg
 from modsoft.runtime.errors import InUse, ModelError, TargetNotReached, UsageError
 from modsoft.training import checkpoint as checkpoints
@@ -23,7 +23,7 @@ SMALL = Settings(history=3, iterations=60, batch=32, layers=2, hidden=8)
 
 def make(episodes: int = 10, steps: int = 30, seed: int = 0) -> dataset.DataSet:
     """A robot whose modules bend at once by 40 degrees times their action, less 10 times the next module's."""
-    robot = robots.load("pneumatic-3")
+    robot = robot_file.load("pneumatic-3")
     action = np.random.default_rng(seed).uniform(-1, 1, (episodes, steps, 3, 1))
     angles = np.zeros((episodes, steps + 1, 3))
     angles[:, 1:] = 40 * action[..., 0] - 10 * np.roll(action[..., 0], -1, axis=-1)
@@ -49,7 +49,7 @@ def test_the_network_learns_and_the_checkpoint_describes_the_run(tmp_path):
     )
     assert list(tmp_path.iterdir()) == [out]
     found = checkpoints.load(out)
-    assert robots.from_dict(found["robot"]) == data.robot
+    assert robot_file.from_dict(found["robot"]) == data.robot
     assert found["features"] == feature_names("pneumatic", 3)
     assert found["network"]["history"] == 3
     assert found["provenance"]["data_sha256"] == data.sha256()

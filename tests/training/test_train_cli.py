@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.choices import NETWORKS
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.training import checkpoint as checkpoints
@@ -37,7 +37,7 @@ def run(folder: Path, *arguments: str, **environment: str) -> subprocess.Complet
 
 @pytest.fixture
 def folder(tmp_path):
-    robot = robots.load("pneumatic-2")
+    robot = robot_file.load("pneumatic-2")
     action = np.random.default_rng(0).uniform(-1, 1, (10, 20, 2, 1))
     angles = np.concatenate([np.zeros((10, 1, 2)), 40 * action[..., 0]], axis=1)
     generation = {"robot": robot.to_dict(), "strategy": "random", "seed": 0, "steps": 20}

@@ -16,7 +16,7 @@ from typing import Any
 import click
 import report
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.entry_point import entry
 from modsoft.study.cells import table
 from modsoft.training.data.backends import cores
@@ -74,7 +74,7 @@ def measured(sizes: list[tuple[str, int]], jobs: list[int]) -> report.Result:
     for robot, samples in sizes:
         each = [collected(robot, samples, number) for number in jobs]
         rows += [{**row, "over_one": each[0]["seconds"] / row["seconds"]} for row in each]
-    return {"about": report.about(backend=simulators.fastest(robots.load("cable-4")).name), "rows": rows}
+    return {"about": report.about(backend=simulators.fastest(robot_file.load("cable-4")).name), "rows": rows}
 
 
 @click.command(help=__doc__)

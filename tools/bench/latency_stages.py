@@ -27,7 +27,7 @@ from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.hil.plant import tool_poses
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.rig import Child
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.codec import encode
 from modsoft.runtime.board.ports import open_port
@@ -58,14 +58,14 @@ Stamps = dict[str, float]  # seconds of the monotonic clock
 
 def robot_of(modules: int, hz: float) -> Robot:
     """The shipped three-module robot with another number of modules, two channels each."""
-    table = robots.load("pneumatic-3").to_dict()
+    table = robot_file.load("pneumatic-3").to_dict()
     table["robot"] |= {"modules": modules, "name": f"pneumatic-{modules}"}
     table["loop"] |= {"hz": hz, "task": ""}
     table["chambers"] = [
         {**table["chambers"][0], "module": channel // 2 + 1, "side": "+-"[channel % 2], "channel": channel}
         for channel in range(2 * modules)
     ]
-    return robots.from_dict(table, f"pneumatic-{modules}")
+    return robot_file.from_dict(table, f"pneumatic-{modules}")
 
 
 def oscillating(modules: int, at_s: float) -> list[Any]:

@@ -12,7 +12,7 @@ from typing import Any
 import click
 import report
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.choices import CORRECTIONS
 from modsoft.runtime.control import correction, tasks
 from modsoft.runtime.control.model import Model
@@ -29,7 +29,7 @@ QUICK_STEPS = 20
 
 def measured(name: str, robot_name: str, steps: int | None) -> list[dict[str, Any]]:
     """A row for each task and correction. steps: of each task; None for all."""
-    robot, model = robots.load(robot_name), Model.load(MODELS / f"{name}.onnx")
+    robot, model = robot_file.load(robot_name), Model.load(MODELS / f"{name}.onnx")
     cases = [(task, each) for task in tasks.available(robot.kind, robot.modules) for each in CORRECTIONS]
     setups = [
         ControllerSetup(

@@ -32,7 +32,7 @@ import report
 import torch
 from training_ways import WAYS, Race
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.entry_point import entry
 from modsoft.study.cells import table
 from modsoft.study.paper import TABLE_1
@@ -234,7 +234,7 @@ def main(
         samples, turn_s = (3200, 1.0) if quick else (SAMPLES, TURN_S)
         if data is None:
             data = Path(folder) / "d.h5"
-            collect.collect(robots.load("cable-4"), data, samples, steps=200 if quick else STEPS_PER_EPISODE)
+            collect.collect(robot_file.load("cable-4"), data, samples, steps=200 if quick else STEPS_PER_EPISODE)
         target_percent = float(np.mean(TABLE_1["bilstm"][0]))
         race = Race(str(data), samples, layers=4, hidden=128, target_percent=target_percent, **race_options)
         if quick:

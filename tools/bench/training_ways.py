@@ -22,7 +22,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch is loaded: s
 import numpy as np
 import torch
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.training import networks, optimizer, train
 from modsoft.training.data import dataset
 from modsoft.training.data.dataset import DataSet, Windows
@@ -154,7 +154,7 @@ def step_times(rounds: int) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     rows = []
     for batch, name, target_share in STEPS:
-        robot = robots.load(name)
+        robot = robot_file.load(name)
         history = BY_KIND[robot.kind]["history"]
         sizes = {"feature_size": history * (robot.state_size + robot.action_size) + 1, "action_size": robot.action_size}
         network = networks.build({"name": "bilstm", "layers": 4, "hidden": 128, **sizes})

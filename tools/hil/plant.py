@@ -25,7 +25,7 @@ from typing import Any, Protocol
 import click
 import numpy as np
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import RobotFileError
@@ -77,11 +77,11 @@ def tool_poses(positions: Array, directors: Array) -> Array:
     return BASE_IN_TRACKER @ in_base
 
 
-def load_robot(robot_file: str | Path) -> Robot:
+def load_robot(file_or_name: str | Path) -> Robot:
     """The robot file of a robot that the rig can run; `RobotFileError` for one without valves."""
-    robot = robots.load(robot_file)
+    robot = robot_file.load(file_or_name)
     if robot.kind != "pneumatic":
-        raise RobotFileError(f"{robot_file}: a {robot.kind} robot has no valves; the rig runs pneumatic robots")
+        raise RobotFileError(f"{file_or_name}: a {robot.kind} robot has no valves; the rig runs pneumatic robots")
     return robot
 
 
@@ -166,12 +166,12 @@ def duties_from(descriptor: int) -> Iterator[Array | None]:
 
 
 @click.command("modsoft-hil-plant")
-@click.option("--robot", "robot_file", required=True, type=Path, help="Robot file, or the name of a shipped robot.")
-def cli(robot_file: Path) -> None:
+@click.option("--robot", "file_or_name", required=True, type=Path, help="Robot file, or the name of a shipped robot.")
+def cli(file_or_name: Path) -> None:
     """The simulated pneumatic robot in real time (started by modsoft-hil)."""
     from modsoft.training.simulation.elastica import Arm  # the simulator takes a second to import
 
-    robot = load_robot(robot_file)
+    robot = load_robot(file_or_name)
 
     def write(line: dict[str, Any]) -> None:
         sys.stdout.write(json.dumps(line) + "\n")

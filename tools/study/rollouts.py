@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.control import correction as corrections
 from modsoft.runtime.control.model import Model
@@ -101,7 +101,7 @@ def desired_of(plan: Plan, name: str, modules: int) -> Array:
 
 def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], add_progress: AddProgress) -> None:
     first = batch[0]
-    robot = robots.load(f"cable-{first.modules}")
+    robot = robot_file.load(f"cable-{first.modules}")
     models = {run.model: Model.load(folder.onnx(run.model)) for run in batch}
     for each in models.values():
         each.check(robot)

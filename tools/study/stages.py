@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control import model_file
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import written
@@ -45,7 +45,7 @@ def collect_s(folder: Folder, data: Data) -> float:
 
 
 def _collect(folder: Folder, jobs: int, data: Data, add_progress: AddProgress) -> None:
-    robot, before = robots.load(data.robot), 0
+    robot, before = robot_file.load(data.robot), 0
 
     def progress(done: int, samples: int) -> None:
         nonlocal before

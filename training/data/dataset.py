@@ -25,7 +25,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import episode_features, state_of
 from modsoft.runtime.errors import ModelError
@@ -51,7 +51,7 @@ class DataSet:
 
     @property
     def robot(self) -> Robot:
-        return robots.from_dict(self.generation["robot"], "data set")
+        return robot_file.from_dict(self.generation["robot"], "data set")
 
     @property
     def samples(self) -> int:
@@ -136,7 +136,7 @@ def _opened(path: Path) -> Iterator[tuple[dict[str, h5py.Dataset], Header]]:
             shape = arrays["action"].shape
             steps = shape[1] if len(shape) == 4 else 0
             generation = checks.generation(attributes["generation"], steps, path)
-            robot = robots.from_dict(generation["robot"], "data set")
+            robot = robot_file.from_dict(generation["robot"], "data set")
             checks.shapes(arrays["configuration"].shape, shape, robot, path)
             borders = checks.stage_borders(attributes["stage_borders"], steps, path)
             rejected = checks.whole_number("rejected", attributes["rejected"], path)

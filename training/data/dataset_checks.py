@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.runtime import robot as robots
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import REST_LIMIT_DEG
 from modsoft.runtime.errors import ModelError, RobotFileError
@@ -79,7 +79,7 @@ def generation(value: Any, steps: int, where: Path) -> dict[str, Any]:
             f"{where}: its generation settings cannot be read ({error}); expected {ATTRIBUTES['generation']}"
         ) from error
     try:
-        robot = robots.from_dict(required.robot, "robot")
+        robot = robot_file.from_dict(required.robot, "robot")
     except RobotFileError as error:  # of this file, not of a robot file that the user can edit
         raise ModelError(f"{where}: the robot of its generation settings cannot be read ({error})") from error
     if required.steps not in (None, steps):
@@ -105,7 +105,7 @@ def stage_borders(value: Any, steps: int, where: Path) -> NDArray[np.int64]:
     return borders.astype(np.int64)
 
 
-def shapes(configuration: tuple[int, ...], action: tuple[int, ...], robot: robots.Robot, where: Path) -> None:
+def shapes(configuration: tuple[int, ...], action: tuple[int, ...], robot: robot_file.Robot, where: Path) -> None:
     """The arrays' shapes, against the robot's and each other's."""
     episodes, steps = action[:2] if len(action) == 4 else (0, 0)
     for name, shape, expected, in_words in (
