@@ -26,12 +26,12 @@ class Kind(NamedTuple):
 
     state: tuple[str, ...]
     action: tuple[str, ...]
-    channels: int  # cables or chambers of each module
+    directions: tuple[tuple[float, ...], ...]  # unit directions in which each cable or chamber bends its module
 
 
 KINDS: dict[str, Kind] = {
-    "cable": Kind(state=("v_z", "v_x", "v_y"), action=("a_0", "a_1"), channels=4),
-    "pneumatic": Kind(state=("v_x", "v_y"), action=("a_0",), channels=2),
+    "cable": Kind(("v_z", "v_x", "v_y"), ("a_0", "a_1"), ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))),
+    "pneumatic": Kind(("v_x", "v_y"), ("a_0",), ((1.0,), (-1.0,))),
 }
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)]
@@ -153,6 +153,11 @@ class Robot(Section, frozen=True):
     @property
     def action_size(self) -> int:
         return len(KINDS[self.kind].action)
+
+    @property
+    def directions(self) -> tuple[tuple[float, ...], ...]:
+        """Unit direction (A components) in which each actuator bends its module."""
+        return KINDS[self.kind].directions
 
     def to_dict(self) -> dict[str, Any]:
         """Plain Python values, for a checkpoint, ONNX metadata or a log."""

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.control.actuation import limited
+from modsoft.runtime.control.actuation import limited, module_actuators
 from modsoft.runtime.control.correction import Correction, NoCorrection
 from modsoft.runtime.control.features import Window, state_of
 from modsoft.runtime.robot import Robot
@@ -79,4 +79,5 @@ class Controller:
 
     def _within_limits(self, raw: Array) -> Array:
         check_actuation(raw)
-        return limited(raw, self.applied, self._robot.limits.largest_actuation_step)
+        largest_step = self._robot.limits.largest_actuation_step
+        return limited(raw, self.applied, largest_step, module_actuators(self._robot.directions))

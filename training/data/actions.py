@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.control.actuation import limited
+from modsoft.runtime.control.actuation import limited, module_actuators
 from modsoft.runtime.robot import Robot
 
 JITTER = (0.003, 0.3)  # of smooth actions, smallest and largest
@@ -83,9 +83,10 @@ def _smooth(robot: Robot, steps: int, rng: np.random.Generator) -> Array:
     least, most = np.log(JITTER)
     jitter = np.exp(rng.uniform(least, most, robot.modules))[:, None]
     actions = np.clip(actions + jitter * rng.uniform(-1.0, 1.0, shape), -1.0, 1.0)
-    previous = np.zeros(shape[1:])
+    previous, largest_step = np.zeros(shape[1:]), robot.limits.largest_actuation_step
+    actuators = module_actuators(robot.directions)
     for step in range(steps):
-        previous = actions[step] = limited(actions[step], previous, robot.limits.largest_actuation_step)
+        previous = actions[step] = limited(actions[step], previous, largest_step, actuators)
     return actions
 
 
