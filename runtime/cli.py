@@ -70,10 +70,10 @@ def _open_ends(robot: robot_file.Robot, beside: Path) -> list[str]:
     return found
 
 
-def _instead(list_ports: bool, check: str | None, print_robot: str | None) -> bool:
-    """Does what was asked for in place of a run, if anything was."""
-    asked = [list_ports, check is not None, print_robot is not None]
-    if sum(asked) > 1:
+def _without_run(list_ports: bool, check: str | None, print_robot: str | None) -> bool:
+    """Handles the options that start no run. Returns whether one was given."""
+    given = [list_ports, check is not None, print_robot is not None]
+    if sum(given) > 1:
         raise UsageError("--list-ports, --check and --print-robot do one thing each and leave; give one of them")
     if list_ports:
         _print_ports()
@@ -81,11 +81,11 @@ def _instead(list_ports: bool, check: str | None, print_robot: str | None) -> bo
         _check_robot(check)
     if print_robot is not None:
         click.echo(robot_file.text_of(print_robot), nl=False)
-    return any(asked)
+    return any(given)
 
 
-def _somebody_there() -> bool:
-    """Whether a person can press Enter."""
+def _has_terminal() -> bool:
+    """Whether an operator can press Enter."""
     try:
         return sys.stdin is not None and sys.stdin.isatty()
     except ValueError:  # closed
@@ -168,7 +168,7 @@ def _somebody_there() -> bool:
     help="Print a shipped robot's file to start your own from, and leave: cable-4, cable-6, pneumatic-2, pneumatic-3.",
 )
 @click.version_option(None, "-V", "--version", package_name="modsoft", prog_name="modsoft-runtime")
-def cli(**told: Any) -> None:
+def cli(**options: Any) -> None:
     """Run one task on a modular soft robot: tracker in, valve pressures out, at a fixed rate.
 
     Takes robot.toml and model.onnx from this folder, tracker and task from the robot file. Asks before it arms.
@@ -191,15 +191,15 @@ def cli(**told: Any) -> None:
       79 stopped by a limit, a fault or a stop key
       130 Ctrl-C               143 SIGTERM        129 SIGHUP
     """
-    if _instead(told.pop("list_ports"), told.pop("check"), told.pop("print_robot")):
+    if _without_run(options.pop("list_ports"), options.pop("check"), options.pop("print_robot")):
         return
-    if not told["yes"] and not told["dry_run"] and not _somebody_there():
+    if not options["yes"] and not options["dry_run"] and not _has_terminal():
         raise UsageError("arming asks for Enter, and there is no terminal to press it at; give --yes, or --dry-run")
     from modsoft.runtime.session import Options, run  # --help does without numpy and onnxruntime
 
-    told["tracker"] = told["tracker"] or ""
-    told["runs"] = told.pop("runs_dir")
-    run(Options(**told))
+    options["tracker"] = options["tracker"] or ""
+    options["runs"] = options.pop("runs_dir")
+    run(Options(**options))
 
 
 main = entry(cli)

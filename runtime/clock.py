@@ -1,4 +1,4 @@
-"""The pace of the loop: ticks at absolute deadlines of a monotonic clock. A late tick is skipped, never made up for."""
+"""The clock of the loop: ticks at absolute deadlines of a monotonic clock. A late tick is skipped, not repeated."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ LATE_MS = 20.0  # a step or an acknowledgement later than this is late: 5 % of t
 
 
 def spinning(wait: Callable[[float], object], now: Callable[[], float] = time.monotonic) -> Callable[[float], object]:
-    """`wait` for a `Ticker`, but without sleep where at most a millisecond is left: what sleeps loses the processor,
-    and its caches, to other processes."""
+    """`wait` for a `Ticker`, but without sleep for the last millisecond: a process that sleeps loses the
+    processor, and its caches, to other processes."""
 
     def wait_or_spin(seconds: float) -> None:
         if seconds > SPIN_S:
@@ -29,7 +29,7 @@ def spinning(wait: Callable[[float], object], now: Callable[[], float] = time.mo
 
 @dataclass(frozen=True)
 class Tick:
-    """A control step: slot `index`, due at `due_s`, begun at `start_s`, after `missed` skipped slots."""
+    """A control step: number `index`, due at `due_s`, begun at `start_s`, after `missed` skipped steps."""
 
     index: int
     due_s: float
@@ -42,12 +42,12 @@ class Tick:
 
 
 class Ticker:
-    """LatestFrame k is due at start + k * period, computed anew each time so that nothing adds up.
+    """Step k is due at start + k * period, computed from k each time so that no error adds up.
 
-    A slot may begin, and send, until half a period after it was due; later than that it is skipped. It also waits for
-    half a period after the last command, which may have gone out late for a process that was halted just then. So two
-    commands are never less than half a period apart, however long the process was starved. `now` must be monotonic: a
-    step of the wall clock has no effect.
+    A step may begin, and send, until half a period after it was due; later than that it is skipped. It also waits for
+    half a period after the last command, which a halted process may have sent late. So two commands are never less than
+    half a period apart, even if the process was starved. `now` must be monotonic: a step of the wall clock has no
+    effect.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Ticker:
         now: Callable[[], float] = time.monotonic,
         wait: Callable[[float], object] = time.sleep,
     ):
-        """`wait(seconds)` may return early, for instance because somebody wants the loop to stop."""
+        """`wait(seconds)` may return early, for instance at a stop request."""
         self.period_s = period_s
         self.now = now
         self._wait = wait
@@ -65,16 +65,16 @@ class Ticker:
         self._index = -1
 
     def start(self, delay_s: float = 0.0) -> None:
-        """LatestFrame 0 is due `delay_s` from now."""
+        """Step 0 is due `delay_s` from now."""
         self._start_s = self.now() + delay_s
         self._index = -1
 
     def due_s(self, index: int) -> float:
-        """When a slot is due, seconds of the clock."""
+        """When a step is due, seconds of the clock."""
         return self._start_s + index * self.period_s
 
     def too_late(self, index: int) -> bool:
-        """Whether this slot may no longer act. Asked again before the command is sent, for a step that took long."""
+        """Whether this step may no longer send. Checked again before sending, after a long step."""
         return self.now() - self.due_s(index) > self.period_s / 2
 
     def sent(self) -> None:
@@ -84,7 +84,7 @@ class Ticker:
     def next(
         self, idle: Callable[[], None] = lambda: None, prepare: Callable[[float], float] = lambda left_s: left_s
     ) -> Tick:
-        """Waits for the next slot. `idle` is called at least once, then every 50 ms; what it raises goes through.
+        """Waits for the next step. Calls `idle` at least once, then every 50 ms; passes its errors on.
 
         `prepare` is called before every wait with the seconds that are left, and returns how many of them to wait: it
         may use a part of the time, and returns 0 to be called again at once.

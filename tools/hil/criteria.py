@@ -21,6 +21,7 @@ from modsoft.hil.valves import (
     vent_limit_ms,
 )
 from modsoft.runtime.arrays import Array
+from modsoft.runtime.clock import LATE_MS
 from modsoft.runtime.control.features import angle_between_deg, bending_error_deg
 from modsoft.runtime.statistics import spread
 
@@ -29,7 +30,7 @@ from modsoft.runtime.statistics import spread
 MIN_TICKS = 100  # fewer give no 99th percentile
 MISSED_TICKS = 0
 HELD_TICKS = 0
-LATENESS_P99_MS = 20.0
+LATENESS_P99_MS = LATE_MS
 VALVE_COUNTS = 1.0  # of the timer: a set-point is rounded to counts once
 DROPPED_BYTES = 0
 CHAMBERS_AT_END_BAR = 0.02
