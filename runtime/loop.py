@@ -113,7 +113,7 @@ class Loop:
         """One control step. Returns the sequence number of its set-points, None where it sent none: the acknowledgement
         of the step before is then not taken for that of this one."""
         frame, sequence = self.frames.latest(), None
-        check = self.validator.judge(frame, self.ticker.now())
+        check = self.validator.check(frame, self.ticker.now())
         record = self._begun(tick, frame, check, controller, acknowledged)
         try:
             faults.frame(check)
@@ -178,7 +178,7 @@ class Loop:
             wall=datetime.now(UTC).isoformat(timespec="milliseconds"),
             late_ms=tick.lateness_s * 1e3,
             missed=tick.missed,
-            frame_status=check.word,
+            frame_status=check.status,
             frame_detail=check.detail,
             frame=None if frame is None else _frame_record(frame, check),
             configuration=check.configuration,

@@ -40,16 +40,16 @@ TRACKER_LOST = (NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED)
 
 
 class FrameCheck(NamedTuple):
-    """What a frame is good for: its configuration (N, 3) if `word` is "good", else None."""
+    """What a frame is good for: its configuration (N, 3) if `status` is "good", else None."""
 
-    word: str
+    status: str
     configuration: Array | None = None
     age_s: float | None = None
     detail: str = ""
 
     @property
     def good(self) -> bool:
-        return self.word == GOOD
+        return self.status == GOOD
 
 
 class FrameValidator:
@@ -70,20 +70,20 @@ class FrameValidator:
         self._rest_mm: list[float] | None = None
         self._prompt: deque[tuple[float, int]] = deque()  # (host's time, device's frame number)
 
-    def judge(self, frame: TrackerFrame | None, now_s: float) -> FrameCheck:
+    def check(self, frame: TrackerFrame | None, now_s: float) -> FrameCheck:
         """Judges the newest frame at `now_s`, seconds of the monotonic clock."""
         if frame is None:
             return FrameCheck(NO_FRAME)
         age_s = now_s - frame.monotonic_s
-        word, detail, configuration = self._order(frame, age_s)
-        if word == GOOD:
-            word, detail, configuration = self.content(frame)
+        status, detail, configuration = self._order(frame, age_s)
+        if status == GOOD:
+            status, detail, configuration = self.content(frame)
         if configuration is not None:
-            word, detail = self._continuity(frame, configuration)
+            status, detail = self._continuity(frame, configuration)
         else:
             self._jumped.clear()
-        if word != GOOD:
-            return FrameCheck(word, None, age_s, detail)
+        if status != GOOD:
+            return FrameCheck(status, None, age_s, detail)
         if self._rest_mm is None:
             self._rest_mm = _lengths_mm(frame)
         self._used, self._used_configuration = frame, configuration
@@ -118,7 +118,7 @@ class FrameValidator:
         return max(0.0, delay_s)
 
     def content(self, frame: TrackerFrame) -> tuple[str, str, Array | None]:
-        """What is wrong with the poses, in a word and in detail, else the configuration (N, 3). Remembers nothing."""
+        """What is wrong with the poses, as a status and a detail, else the configuration (N, 3). Remembers nothing."""
         count = self.robot.modules + 1
         if frame.poses.shape != (count, 4, 4) or len(frame.valid) != count:
             return WRONG_NUMBER, f"{len(frame.poses)}, expected {count}", None
@@ -193,17 +193,17 @@ class FaultCounter:
         self.bad_frames = 0  # in a row
         self.missed_ticks = 0  # in a row
 
-    def frame(self, judged: FrameCheck) -> None:
+    def frame(self, check: FrameCheck) -> None:
         """Raises `LostInRun` or `Tripped` at the last frame in a row that the robot file allows to be bad."""
-        if judged.good:
+        if check.good:
             self.bad_frames = 0
             return
         self.bad_frames += 1
         if self.bad_frames >= self._invalid_frames:
-            kind: type[ModsoftError] = LostInRun if judged.word in TRACKER_LOST else Tripped
-            detail = f" ({judged.detail})" if judged.detail else ""
+            kind: type[ModsoftError] = LostInRun if check.status in TRACKER_LOST else Tripped
+            detail = f" ({check.detail})" if check.detail else ""
             raise kind(
-                f"tracker: {self.bad_frames} ticks in a row without a good frame, the last one {judged.word}{detail}; "
+                f"tracker: {self.bad_frames} ticks in a row without a good frame, the last one {check.status}{detail}; "
                 "look at the tracker and the markers, then start again"
             )
 

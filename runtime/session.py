@@ -253,7 +253,7 @@ def _rest(
     until_s = now() + FIRST_FRAME_WAIT_S
     while True:
         frame = frames.latest()
-        check = validator.judge(frame, now())
+        check = validator.check(frame, now())
         if frame is not None and check.configuration is not None:
             check_rest(check.configuration, frame.poses)
             return check.configuration
@@ -263,7 +263,7 @@ def _rest(
             detail = check.detail or frames.problem
             detail = f" ({detail})" if detail else ""
             raise missing(
-                f"tracker: no good frame within {FIRST_FRAME_WAIT_S:.0f} s, the last one {check.word}{detail}; "
+                f"tracker: no good frame within {FIRST_FRAME_WAIT_S:.0f} s, the last one {check.status}{detail}; "
                 "are all tools in view?"
             )
         stop.wait(0.01)

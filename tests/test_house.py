@@ -65,6 +65,20 @@ def test_c_files_and_functions_are_short_or_give_a_reason():
             assert line != "}" or number - started < 60, f"{path}:{started + 1}: longer than 60 lines"
 
 
+def test_python_files_and_functions_are_short_or_give_a_reason():
+    for folder in (*FOLDERS.values(), "tools", "examples"):
+        for path in (ROOT / folder).rglob("*.py"):
+            lines = path.read_text().splitlines()
+            assert len(lines) <= 300 or "bove 300 lines" in "\n".join(lines[:30]), path
+            for node in ast.walk(ast.parse("\n".join(lines))):
+                if not isinstance(node, ast.FunctionDef):
+                    continue
+                docstring = len(ast.get_docstring(node, clean=False).splitlines()) if ast.get_docstring(node) else 0
+                if node.end_lineno - node.lineno - docstring >= 60:
+                    start = "\n".join(lines[node.lineno - 1 : node.lineno + 5])
+                    assert "bove 60 lines" in start, f"{path}:{node.lineno}: {node.name} is longer than 60 lines"
+
+
 @pytest.mark.parametrize("generator", ["gen_protocol", "wiring"])
 def test_generated_file_is_up_to_date(generator):
     """firmware/protocol.h follows runtime/board/protocol.py, docs/wiring.svg follows firmware/pins.h."""

@@ -70,7 +70,7 @@ class Tracker:
                 continue
             read.first_s = read.first_s or time.monotonic() - began_s
             read.frames.append(frame)
-            check = validator.judge(frame, time.monotonic())
+            check = validator.check(frame, time.monotonic())
             if check.good:
                 read.good += 1
                 read.wrong += np.abs(bending_angle_deg(check.configuration) - ANGLES_DEG).max() > 0.1

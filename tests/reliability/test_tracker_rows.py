@@ -22,16 +22,19 @@ RUN_S = 8 * PERIOD_S  # of a run before its fault
 def ended(world):
     """Runs until the tracker ends the run; seconds from the last good frame to the start of the venting."""
     good_s = []
-    world.loop.validator.judge, judge = lambda *told: noted(judge(*told), told[0], good_s), world.loop.validator.judge
+    world.loop.validator.check, validator = (
+        lambda *told: noted(validator(*told), told[0], good_s),
+        world.loop.validator.check,
+    )
     with pytest.raises((LostInRun, Tripped)):
         world.run()
     return world.time_s - good_s[-1]
 
 
-def noted(judged, frame, good_s):
-    if judged.good:
+def noted(check, frame, good_s):
+    if check.good:
         good_s.append(frame.monotonic_s)
-    return judged
+    return check
 
 
 def held(world):
@@ -142,7 +145,7 @@ def noise(rng, now_s, drift):
 def test_row_15_delayed(matrix_row, full):
     """Frames that are late on the line, which the host sees, or in the device, which only its count tells."""
     rng, tries, used, worst_s = np.random.default_rng(15), 1_000_000 if full else 20_000, 0, 0.0
-    judge, now_s, seen_s = FrameValidator(ROBOT), 1000.0, 0.0
+    validator, now_s, seen_s = FrameValidator(ROBOT), 1000.0, 0.0
     for step in range(tries):
         now_s += PERIOD_S
         late = rng.choice(["no", "line", "device", "both"], p=[0.4, 0.2, 0.2, 0.2]) if step >= 10 else "no"
@@ -154,7 +157,7 @@ def test_row_15_delayed(matrix_row, full):
         frame = TrackerFrame(
             number, now_s - on_line_s, planar_poses((1.0, 2.0, 3.0)), np.ones(4, bool), np.full(4, 0.1), 60.0
         )
-        if judge.judge(frame, now_s).good:
+        if validator.check(frame, now_s).good:
             assert number / 60 > seen_s, "an older frame after a newer one"
             used, seen_s = used + 1, number / 60
             worst_s = max(worst_s, on_line_s + in_device_s)
@@ -285,7 +288,7 @@ def test_row_18_hidden_wrong_number_swapped(matrix_row, full):
 
 def test_row_19_numbers_backwards(matrix_row, full):
     rng, tries, used, dropped = np.random.default_rng(19), 1_000_000 if full else 20_000, 0, 0
-    slot, judge = LatestFrame(), FrameValidator(ROBOT)
+    slot, validator = LatestFrame(), FrameValidator(ROBOT)
     good, newest, last, now_s = planar_poses((1.0, 2.0, 3.0)), -1, -1, 1000.0
     for step in range(tries):
         now_s += 1 / 60
@@ -295,8 +298,8 @@ def test_row_19_numbers_backwards(matrix_row, full):
         slot.put(frame)
         dropped += number <= newest
         newest = max(newest, number)
-        seen = frame if step % 2 else slot.latest()  # the judge does not count on the slot
-        if judge.judge(seen, now_s + 0.001).good:
+        seen = frame if step % 2 else slot.latest()  # the validator does not count on the slot
+        if validator.check(seen, now_s + 0.001).good:
             used += seen.device_frame <= last
             last = seen.device_frame
     assert slot.counts["repeated"] + slot.counts["backwards"] == dropped

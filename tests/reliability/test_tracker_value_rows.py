@@ -30,7 +30,7 @@ def statuses(hz, seconds, rng, delay_s=lambda at_s: 0.0):
             rate.add(number, requested_s)
             newest = TrackerFrame(number, requested_s, good, np.ones(4, bool), np.full(4, 0.1), rate.hz)
         if at_s >= tick_s:
-            checks.append((tick_s, validator.judge(newest, requested_s + 0.02).word))
+            checks.append((tick_s, validator.check(newest, requested_s + 0.02).status))
             tick_s = next(ticks)
     return checks
 
@@ -38,8 +38,8 @@ def statuses(hz, seconds, rng, delay_s=lambda at_s: 0.0):
 def test_row_35_other_frame_rates(matrix_row, full):
     rng, minutes, alarms, ticks = np.random.default_rng(35), 60 if full else 3, 0, 0
     for hz in RATES_HZ:
-        words = [word for _, word in statuses(hz, 60.0 * minutes, rng)]
-        alarms, ticks = alarms + len(words) - words.count("good"), ticks + len(words)
+        found = [status for _, status in statuses(hz, 60.0 * minutes, rng)]
+        alarms, ticks = alarms + len(found) - found.count("good"), ticks + len(found)
     matrix_row(
         35,
         fault=f"none: frame rates of {RATES_HZ[0]:g} to {RATES_HZ[-1]:g} Hz, learned",
@@ -52,9 +52,9 @@ def test_row_35_other_frame_rates(matrix_row, full):
     slowest_s, tries = 0.0, 0
     for hz, from_s in itertools.product(RATES_HZ, rng.uniform(500.0, 590.0, 10 if full else 2)):
         found = statuses(hz, from_s - 500.0 + 20.0, rng, lambda at_s, from_s=from_s: 0.6 if at_s > from_s else 0.0)
-        assert all(word == "good" for at_s, word in found if at_s < from_s)
-        late = [(at_s, word) for at_s, word in found if at_s > from_s + 0.6]  # the device counts on after its pause
-        slowest_s = max([slowest_s, *(at_s - from_s for at_s, word in late if word == "good")])
+        assert all(status == "good" for at_s, status in found if at_s < from_s)
+        late = [(at_s, status) for at_s, status in found if at_s > from_s + 0.6]  # the device counts on after its pause
+        slowest_s = max([slowest_s, *(at_s - from_s for at_s, status in late if status == "good")])
         tries += 1
     matrix_row(
         35,
@@ -89,23 +89,23 @@ def ended(world):
 def test_row_36_status_volume_and_rms_error(matrix_row, full):
     rng, worst_s = np.random.default_rng(36), dict.fromkeys(INVALID, 0.0)
     tries = 3000 if full else 60
-    for word, _ in itertools.product(INVALID, range(tries)):
+    for status, _ in itertools.product(INVALID, range(tries)):
         world = World(steps=20)
         world.frame_age_s = rng.uniform(0.002, 0.045)
-        changes = INVALID[word](rng, rng.integers(4))
+        changes = INVALID[status](rng, rng.integers(4))
         world.corrupted.append((world.time_s + rng.uniform(PERIOD_S, 8 * PERIOD_S), np.inf, corrupting(**changes)))
         error, took_s = ended(world)
         assert isinstance(error, Tripped)
-        assert word in str(error)
-        assert [record.frame_status for record in world.ticks[-3:]] == [word] * 3
-        worst_s[word] = max(worst_s[word], took_s)
-    for word in INVALID:
+        assert status in str(error)
+        assert [record.frame_status for record in world.ticks[-3:]] == [status] * 3
+        worst_s[status] = max(worst_s[status], took_s)
+    for status in INVALID:
         matrix_row(
             36,
-            fault=f"a tool with {word}",
+            fault=f"a tool with {status}",
             tries=tries,
             limit="0 used; vent 1.25 s after the last valid frame",
-            worst=f"0; {worst_s[word]:.3f} s",
+            worst=f"0; {worst_s[status]:.3f} s",
             clock="virtual",
         )
     assert max(worst_s.values()) <= VENT_LIMIT_S

@@ -21,17 +21,17 @@ def frame(number, at_s, angles=(0.0, 0.0, 0.0), **changes):
 
 
 def settled(start_s=100.0):
-    """A judge that has seen one good frame, number 6000 at `start_s`."""
-    judge = FrameValidator(ROBOT)
-    assert judge.judge(frame(6000, start_s), start_s + 0.02).good
-    return judge
+    """A validator that has seen one good frame, number 6000 at `start_s`."""
+    validator = FrameValidator(ROBOT)
+    assert validator.check(frame(6000, start_s), start_s + 0.02).good
+    return validator
 
 
 def test_a_good_frame_gives_its_configuration():
-    judged = FrameValidator(ROBOT).judge(frame(1, 100.0, (3.0, 30.0, -40.0)), 100.02)
-    assert judged.good
-    assert judged.age_s == pytest.approx(0.02)
-    np.testing.assert_allclose(bending_angle_deg(judged.configuration), [3.0, 30.0, -40.0])
+    check = FrameValidator(ROBOT).check(frame(1, 100.0, (3.0, 30.0, -40.0)), 100.02)
+    assert check.good
+    assert check.age_s == pytest.approx(0.02)
+    np.testing.assert_allclose(bending_angle_deg(check.configuration), [3.0, 30.0, -40.0])
 
 
 def one_nan(poses):
@@ -65,18 +65,18 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("word", BAD)
-def test_each_bad_frame_is_refused_by_name(word):
-    judge = settled()
-    judged = judge.judge(BAD[word](), 100.4 if word != safety.DELAYED else 100.79)
-    assert judged.word == word
-    assert judged.configuration is None
+@pytest.mark.parametrize("status", BAD)
+def test_each_bad_frame_is_refused_by_name(status):
+    validator = settled()
+    check = validator.check(BAD[status](), 100.4 if status != safety.DELAYED else 100.79)
+    assert check.status == status
+    assert check.configuration is None
     # and the next good one is used again
-    assert judge.judge(frame(6072, 101.19), 101.2).good
+    assert validator.check(frame(6072, 101.19), 101.2).good
 
 
 @pytest.mark.parametrize(
-    ("word", "detail"),
+    ("status", "detail"),
     [
         (safety.HIDDEN, "module 2"),
         (safety.NOT_FINITE, "module 2"),
@@ -85,12 +85,12 @@ def test_each_bad_frame_is_refused_by_name(word):
         (safety.INACCURATE, "module 2 1.01 mm, at most 1 mm"),
     ],
 )
-def test_detail_names_the_tool(word, detail):
-    assert settled().judge(BAD[word](), 100.4).detail == detail
+def test_detail_names_the_tool(status, detail):
+    assert settled().check(BAD[status](), 100.4).detail == detail
 
 
 @pytest.mark.parametrize(
-    ("bits", "word"),
+    ("bits", "status"),
     [
         (0x31, "good"),
         (0x3F, "good"),  # buttons of the tool
@@ -102,21 +102,21 @@ def test_detail_names_the_tool(word, detail):
         (0x01, safety.PORT_ERROR),
     ],
 )
-def test_port_status_is_checked(bits, word):
-    judged = FrameValidator(ROBOT).judge(frame(1, 100.0, port_status=(0x31, 0x31, 0x31, bits)), 100.01)
-    assert judged.word == word
+def test_port_status_is_checked(bits, status):
+    check = FrameValidator(ROBOT).check(frame(1, 100.0, port_status=(0x31, 0x31, 0x31, bits)), 100.01)
+    assert check.status == status
 
 
 def test_limits_of_status_and_rms_are_those_of_the_robot_file():
     robot = with_limits(refused_port_status=0x40, largest_rms_mm=0.05)
-    judge = FrameValidator(robot)
+    validator = FrameValidator(robot)
     quality = np.full(4, 0.04)
-    assert judge.judge(frame(1, 100.0, quality=quality, port_status=(0xB1,) * 4), 100.01).good
-    assert judge.judge(frame(2, 100.1, port_status=(0x31,) * 4), 100.11).word == safety.INACCURATE
+    assert validator.check(frame(1, 100.0, quality=quality, port_status=(0xB1,) * 4), 100.01).good
+    assert validator.check(frame(2, 100.1, port_status=(0x31,) * 4), 100.11).status == safety.INACCURATE
 
 
 def test_frame_without_quality_and_status_is_valid():
-    assert FrameValidator(ROBOT).judge(frame(1, 100.0, quality=np.full(4, np.nan)), 100.01).good
+    assert FrameValidator(ROBOT).check(frame(1, 100.0, quality=np.full(4, np.nan)), 100.01).good
 
 
 def with_limits(**limits):
@@ -126,20 +126,20 @@ def with_limits(**limits):
 
 
 def test_jump_that_stays_is_accepted_after_three_confirming_frames():
-    judge = settled()
-    words = []
+    validator = settled()
+    statuses = []
     for step in range(1, 6):
         now_s = 100.0 + step * PERIOD_S
-        words.append(judge.judge(frame(6000 + 24 * step, now_s, (0.0, 0.0, 90.0)), now_s + 0.02).word)
-    assert words == [safety.JUMP] * 3 + ["good"] * 2
+        statuses.append(validator.check(frame(6000 + 24 * step, now_s, (0.0, 0.0, 90.0)), now_s + 0.02).status)
+    assert statuses == [safety.JUMP] * 3 + ["good"] * 2
 
 
 def test_jump_that_stays_ends_a_run_of_the_shipped_limits():
-    judge, faults = settled(), FaultCounter(ROBOT)
+    validator, faults = settled(), FaultCounter(ROBOT)
     checks = []
     for step in range(1, 4):
         now_s = 100.0 + step * PERIOD_S
-        checks.append(judge.judge(frame(6000 + 24 * step, now_s, (0.0, 0.0, 90.0)), now_s + 0.02))
+        checks.append(validator.check(frame(6000 + 24 * step, now_s, (0.0, 0.0, 90.0)), now_s + 0.02))
     faults.frame(checks[0])
     faults.frame(checks[1])
     with pytest.raises(Tripped, match="the last one jump"):
@@ -149,63 +149,63 @@ def test_jump_that_stays_ends_a_run_of_the_shipped_limits():
 @pytest.mark.parametrize("between", [(0.0, 0.0, -90.0), None])
 def test_confirming_frames_are_in_a_row_and_within_the_gate_of_each_other(between):
     """Another jump, or a hidden tool, starts the confirmation again."""
-    judge = settled()
+    validator = settled()
     for step in range(1, 12):
         now_s = 100.0 + step * PERIOD_S
         disturbed = step % 3 == 0
         valid = np.array([True, True, True, not (disturbed and between is None)])
         angles = between if disturbed and between else (0.0, 0.0, 90.0)
-        assert not judge.judge(frame(6000 + 24 * step, now_s, angles, valid=valid), now_s + 0.02).good
+        assert not validator.check(frame(6000 + 24 * step, now_s, angles, valid=valid), now_s + 0.02).good
 
 
 def test_a_gap_allows_no_larger_jump():
     """The command is held without a valid frame, so that the robot does not move any further."""
-    judge = settled()
+    validator = settled()
     now_s = 100.0 + 3 * PERIOD_S
-    assert judge.judge(frame(6072, now_s, (0.0, 0.0, 90.0)), now_s + 0.02).word == safety.JUMP
+    assert validator.check(frame(6072, now_s, (0.0, 0.0, 90.0)), now_s + 0.02).status == safety.JUMP
 
 
 def test_no_limits_in_the_robot_file_give_a_gate():
     table = ROBOT.to_dict()
     del table["limits"]
-    judge = FrameValidator(robot_file.from_dict(table))
-    assert judge.judge(frame(6000, 100.0), 100.02).good
-    assert judge.judge(frame(6024, 100.4, (0.0, 0.0, 90.0)), 100.42).word == safety.JUMP
+    validator = FrameValidator(robot_file.from_dict(table))
+    assert validator.check(frame(6000, 100.0), 100.02).good
+    assert validator.check(frame(6024, 100.4, (0.0, 0.0, 90.0)), 100.42).status == safety.JUMP
 
 
 def test_a_robot_as_fast_as_its_limits_allow_is_no_jump():
     """The largest actuation step, over a reach of 90 degrees to each side, with half of it again as swing."""
-    judge = settled()
+    validator = settled()
     angle, sign = 0.0, 1.0
     for step in range(1, 40):
         if abs(angle) >= 90.0:
             sign = -sign
         angle += sign * 1.5 * 90.0 * ROBOT.limits.largest_actuation_step
         now_s = 100.0 + step * PERIOD_S
-        judged = judge.judge(frame(6000 + 24 * step, now_s, (0.0, 0.0, angle)), now_s + 0.02)
-        assert judged.good, judged
+        check = validator.check(frame(6000 + 24 * step, now_s, (0.0, 0.0, angle)), now_s + 0.02)
+        assert check.good, check
 
 
 def test_a_frozen_tracker_is_found_within_three_ticks_whatever_the_phase():
     for phase_s in np.linspace(0.0, PERIOD_S, 9):
-        judge, held = settled(), frame(6000 + round(60 * phase_s), 100.0 + phase_s)
-        words = [judge.judge(held, 100.0 + phase_s + 0.01 + k * PERIOD_S).word for k in range(3)]
-        assert words[1] != "good"
-        assert words[2] != "good"
+        validator, held = settled(), frame(6000 + round(60 * phase_s), 100.0 + phase_s)
+        statuses = [validator.check(held, 100.0 + phase_s + 0.01 + k * PERIOD_S).status for k in range(3)]
+        assert statuses[1] != "good"
+        assert statuses[2] != "good"
 
 
 def test_a_delay_is_found_although_the_host_sees_fresh_frames():
-    judge = FrameValidator(ROBOT)
+    validator = FrameValidator(ROBOT)
     for step in range(10):
         now_s = 100.0 + step * PERIOD_S
-        assert judge.judge(frame(int((now_s - 0.02) * 60), now_s - 0.01), now_s).good
+        assert validator.check(frame(int((now_s - 0.02) * 60), now_s - 0.01), now_s).good
     now_s += PERIOD_S
-    delayed = judge.judge(frame(int((now_s - 0.02 - 0.35) * 60), now_s - 0.01), now_s)
+    delayed = validator.check(frame(int((now_s - 0.02 - 0.35) * 60), now_s - 0.01), now_s)
     assert delayed.good  # 0.36 s: within the robot file's 0.4 s
     for _ in range(200):  # a delay that lasts does not become the norm
         now_s += PERIOD_S
-        judged = judge.judge(frame(int((now_s - 0.02 - 0.45) * 60), now_s - 0.01), now_s)
-        assert judged.word == safety.DELAYED
+        check = validator.check(frame(int((now_s - 0.02 - 0.45) * 60), now_s - 0.01), now_s)
+        assert check.status == safety.DELAYED
 
 
 @given(
@@ -216,8 +216,8 @@ def test_a_delay_is_found_although_the_host_sees_fresh_frames():
 def test_what_is_not_finite_never_becomes_a_configuration(tool, entry, value):
     poses = planar_poses((5.0, 30.0, 80.0))
     poses[tool][entry] = value
-    judged = FrameValidator(ROBOT).judge(frame(1, 1.0, poses=poses), 1.01)
-    assert judged.word == safety.NOT_FINITE
+    check = FrameValidator(ROBOT).check(frame(1, 1.0, poses=poses), 1.01)
+    assert check.status == safety.NOT_FINITE
 
 
 @pytest.mark.filterwarnings("ignore:(overflow|invalid value):RuntimeWarning")
@@ -226,41 +226,41 @@ def test_axes_too_large_for_a_length_are_distorted():
     for axes in (np.full((3, 3), 1e200), np.array([[1e200, -1e200, 0.0]] * 3)):
         poses = planar_poses((5.0, 30.0, 80.0))
         poses[1:3, :3, :3] = axes
-        assert FrameValidator(ROBOT).judge(frame(1, 1.0, poses=poses), 1.01).word == safety.DISTORTED
+        assert FrameValidator(ROBOT).check(frame(1, 1.0, poses=poses), 1.01).status == safety.DISTORTED
 
 
 # ---- what is waited out
 
 
 def test_two_bad_frames_are_waited_out_and_the_third_ends_the_run():
-    guard = FaultCounter(ROBOT)
+    faults = FaultCounter(ROBOT)
     for _ in range(5):
-        guard.frame(FrameCheck(safety.HIDDEN))
-        guard.frame(FrameCheck(safety.JUMP))
-        guard.frame(FrameCheck("good", np.zeros((3, 3))))
-    guard.frame(FrameCheck(safety.HIDDEN))
-    guard.frame(FrameCheck(safety.HIDDEN))
+        faults.frame(FrameCheck(safety.HIDDEN))
+        faults.frame(FrameCheck(safety.JUMP))
+        faults.frame(FrameCheck("good", np.zeros((3, 3))))
+    faults.frame(FrameCheck(safety.HIDDEN))
+    faults.frame(FrameCheck(safety.HIDDEN))
     with pytest.raises(Tripped, match=r"3 ticks in a row.*tool hidden \(module 2\)"):
-        guard.frame(FrameCheck(safety.HIDDEN, detail="module 2"))
+        faults.frame(FrameCheck(safety.HIDDEN, detail="module 2"))
 
 
-@pytest.mark.parametrize("word", safety.TRACKER_LOST)
-def test_a_tracker_that_is_gone_is_lost_not_tripped(word):
-    guard = FaultCounter(ROBOT)
-    guard.frame(FrameCheck(word))
-    guard.frame(FrameCheck(word))
-    with pytest.raises(LostInRun, match=word):
-        guard.frame(FrameCheck(word))
+@pytest.mark.parametrize("status", safety.TRACKER_LOST)
+def test_a_tracker_that_is_gone_is_lost_not_tripped(status):
+    faults = FaultCounter(ROBOT)
+    faults.frame(FrameCheck(status))
+    faults.frame(FrameCheck(status))
+    with pytest.raises(LostInRun, match=status):
+        faults.frame(FrameCheck(status))
 
 
 def test_more_than_two_missed_ticks_end_the_run():
-    guard = FaultCounter(ROBOT)
-    guard.missed(2)
-    guard.on_time()
-    guard.missed(1)
-    guard.missed(1)
+    faults = FaultCounter(ROBOT)
+    faults.missed(2)
+    faults.on_time()
+    faults.missed(1)
+    faults.missed(1)
     with pytest.raises(Tripped, match="3 control ticks"):
-        guard.missed(1)
+        faults.missed(1)
     with pytest.raises(Tripped, match="8 control ticks"):
         FaultCounter(ROBOT).missed(8)
 
@@ -279,7 +279,7 @@ def test_an_answer_a_little_out_of_range_is_left_to_the_limits():
 
 
 def rest(poses):
-    check_rest(FrameValidator(ROBOT).judge(frame(1, 1.0, poses=poses), 1.0).configuration, poses)
+    check_rest(FrameValidator(ROBOT).check(frame(1, 1.0, poses=poses), 1.0).configuration, poses)
 
 
 def test_rest():

@@ -15,14 +15,14 @@ STRAIGHT = (0.0, 0.0, 0.0)
 def settled(robot=ROBOT, **first):
     """A validator that has accepted a straight robot at time 0, frame 0."""
     validator = FrameValidator(robot)
-    assert validator.judge(tracker_frame(0, 0.0, **first), 0.0).good
+    assert validator.check(tracker_frame(0, 0.0, **first), 0.0).good
     return validator
 
 
 def status_and_detail(validator, **changes):
     """Of the frame one period after the first."""
-    check = validator.judge(tracker_frame(24, PERIOD_S, **changes), PERIOD_S)
-    return check.word, check.detail
+    check = validator.check(tracker_frame(24, PERIOD_S, **changes), PERIOD_S)
+    return check.status, check.detail
 
 
 def straight_poses(*heights_mm):
@@ -36,26 +36,26 @@ def straight_poses(*heights_mm):
 
 @pytest.mark.parametrize(("age_s", "status"), [(0.5, "good"), (0.5625, safety.STALE)])
 def test_largest_age_is_still_accepted(age_s, status):
-    assert FrameValidator(with_limits(tracker_age_s=0.5)).judge(tracker_frame(1, 1.0), 1.0 + age_s).word == status
+    assert FrameValidator(with_limits(tracker_age_s=0.5)).check(tracker_frame(1, 1.0), 1.0 + age_s).status == status
 
 
 @pytest.mark.parametrize(("delay_s", "status"), [(0.5, "good"), (0.75, safety.DELAYED)])
 def test_largest_delay_is_still_accepted(delay_s, status):
     validator = settled(with_limits(tracker_age_s=0.5), device_hz=4.0)
     frame = tracker_frame(round(4 * (1.0 - delay_s)), 1.0, device_hz=4.0)
-    assert validator.judge(frame, 1.0).word == status
+    assert validator.check(frame, 1.0).status == status
 
 
 def test_delay_is_reported_with_the_age():
     validator = settled()
-    check = validator.judge(tracker_frame(27, 0.8), 0.9)
-    assert (check.word, check.detail) == (safety.DELAYED, "0.45 s old by the device's count, at most 0.4 s")
+    check = validator.check(tracker_frame(27, 0.8), 0.9)
+    assert (check.status, check.detail) == (safety.DELAYED, "0.45 s old by the device's count, at most 0.4 s")
 
 
 @pytest.mark.parametrize("age_s", [0.01, 0.39])
 def test_device_of_unknown_rate_has_no_delay(age_s):
     validator = settled(device_hz=None)
-    assert validator.judge(tracker_frame(1, 2.0, device_hz=None), 2.0 + age_s).good
+    assert validator.check(tracker_frame(1, 2.0, device_hz=None), 2.0 + age_s).good
 
 
 @pytest.mark.parametrize(("delayed_until_s", "status"), [(60.0, safety.DELAYED), (60.5, "good")])
@@ -64,9 +64,9 @@ def test_promptest_frame_is_forgotten_after_a_minute(delayed_until_s, status):
     validator = settled(with_limits(tracker_age_s=0.5), device_hz=4.0)
     for at_s in np.arange(1.0, delayed_until_s + 0.25, 0.25):
         frame = tracker_frame(round(4 * (at_s - 0.5)), at_s, device_hz=4.0)
-        assert validator.judge(frame, at_s).good
+        assert validator.check(frame, at_s).good
     probe = tracker_frame(round(4 * (at_s - 0.5)) + 1, at_s + 0.5, device_hz=4.0)  # 0.75 s delayed
-    assert validator.judge(probe, at_s + 0.5).word == status
+    assert validator.check(probe, at_s + 0.5).status == status
 
 
 # ---- content
@@ -188,27 +188,27 @@ def test_order_of_tools_is_measured_along_the_axis_of_the_tool_before():
 def test_module_moves_by_the_largest_actuation_step_and_the_noise_at_most(passed_s, angle, detail):
     """180 degrees times a step of 0.4 in each period, and 5 degrees."""
     validator, now_s = FrameValidator(ROBOT), 50.0 + passed_s
-    assert validator.judge(tracker_frame(3000, 50.0), 50.0).good
-    check = validator.judge(tracker_frame(3000 + round(60 * passed_s), now_s, (0.0, 0.0, angle)), now_s)
+    assert validator.check(tracker_frame(3000, 50.0), 50.0).good
+    check = validator.check(tracker_frame(3000 + round(60 * passed_s), now_s, (0.0, 0.0, angle)), now_s)
     assert (check.good, check.detail) == (not detail, detail)
 
 
 def test_movement_at_the_limit_is_accepted(monkeypatch):
     validator = settled()
     monkeypatch.setattr(safety, "angle_between_deg", lambda *configurations: np.array([0.0, 5.0, 0.0]))
-    assert validator.judge(tracker_frame(1, 0.0), 0.0).good
+    assert validator.check(tracker_frame(1, 0.0), 0.0).good
 
 
 def checks(validator, robot_poses):
     """The status of one frame a period for each entry."""
     frames = [tracker_frame(24 * step, step * PERIOD_S, poses=poses) for step, poses in enumerate(robot_poses, 1)]
-    return [validator.judge(frame, frame.monotonic_s).word for frame in frames]
+    return [validator.check(frame, frame.monotonic_s).status for frame in frames]
 
 
 def test_valid_frame_between_jumps_starts_the_confirmation_again():
     jump, still = planar_poses((0.0, 0.0, 90.0)), planar_poses(STRAIGHT)
-    words = checks(settled(), [jump, jump, still, jump, jump, jump, jump])
-    assert words == [safety.JUMP, safety.JUMP, "good", safety.JUMP, safety.JUMP, safety.JUMP, "good"]
+    statuses = checks(settled(), [jump, jump, still, jump, jump, jump, jump])
+    assert statuses == [safety.JUMP, safety.JUMP, "good", safety.JUMP, safety.JUMP, safety.JUMP, "good"]
 
 
 def test_confirming_frames_are_compared_with_the_one_before():

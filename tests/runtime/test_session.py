@@ -21,16 +21,16 @@ class Board:
     """Answers a request to vent with `word`, or raises it."""
 
     def __init__(self, word, pressed=()):
-        self.word, self.modes, self.statistics, self.pressed = word, [], {"sets": 3}, dict(pressed)
+        self.status, self.modes, self.statistics, self.pressed = word, [], {"sets": 3}, dict(pressed)
 
     def residual_pressures_bar(self):
         return self.pressed
 
     def vent(self, mode):
         self.modes.append(mode)
-        if isinstance(self.word, Exception):
-            raise self.word
-        return self.word
+        if isinstance(self.status, Exception):
+            raise self.status
+        return self.status
 
 
 class Ending:

@@ -191,7 +191,7 @@ def _run_loop(
         Stamped(model, "actuate", stamps, "features", "actuation"),
         np.repeat(from_angles_deg(np.zeros((1, robot.modules))), count, axis=0),
         latest,
-        Stamped(validator, "judge", stamps, "taken", "validated"),
+        Stamped(validator, "check", stamps, "taken", "validated"),
         Stamped(board, "set_pressures", stamps, "pressures", "transferred"),
         Ticker(robot.loop.period_s, time.monotonic, spinning(wait)),
         stop,
