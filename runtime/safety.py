@@ -1,4 +1,4 @@
-"""What is refused, what is waited out, and when the run ends: frames, missed ticks, and the model's answers."""
+"""Checks of frames, missed ticks and actuations: which of them are refused, and how many of them end a run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from modsoft.runtime.errors import LostInRun, ModelError, ModsoftError, Tripped
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.tracking.frame import TrackerFrame
 
-MISSED_IN_A_ROW = 2  # skipped ticks that are waited out; the board's own timer vents after 1 s
+MISSED_IN_A_ROW = 2  # skipped ticks that do not end the run; the board's own timer vents after 1 s
 RAW_LIMIT = 3.0  # the actuation runs from -1 to 1: a network that answers this far out extrapolates
 BASELINE_S = 60.0  # over which the device's count is compared with the host's clock: 100 ppm make 6 ms of it
 BASELINE_STEP_S = 0.25  # between two frames of the baseline: a fast loop keeps no more of them than a slow one
@@ -30,7 +30,7 @@ PORT_IN_USE = 0x30  # initialised and enabled
 PORT_OUT_OF_VOLUME = 0x40
 PORT_ERRORS = {0x80: "partially out of volume", 0x100: "sensor or algorithm", 0x200: "infrared interference"}
 
-# Why a frame is not used. With the first group the tracker is as good as gone.
+# Why a frame is not used. In the first group the tracker is lost.
 NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED = "no frame", "stale", "frozen", "backwards", "delayed"
 OUT_OF_VOLUME, PORT_ERROR, INACCURATE = "out of volume", "port status", "RMS error"
 WRONG_NUMBER, HIDDEN, NOT_FINITE, DISTORTED = "wrong number of tools", "tool hidden", "not finite", "distorted"
@@ -40,7 +40,7 @@ TRACKER_LOST = (NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED)
 
 
 class FrameCheck(NamedTuple):
-    """What a frame is good for: its configuration (N, 3) if `status` is "good", else None."""
+    """Whether a frame can be used: its configuration (N, 3) if `status` is "good", else None."""
 
     status: str
     configuration: Array | None = None
@@ -53,7 +53,7 @@ class FrameCheck(NamedTuple):
 
 
 class FrameValidator:
-    """Judges the newest frame at every tick; remembers the last good one.
+    """Checks the newest frame at every tick, against the last good one among others.
 
     The gate on jumps: over the whole range of the actuation a module bends through half a turn at most, twice that for
     the swing, so in one period it moves by 180 degrees times the largest actuation step at most. Without a valid frame
@@ -71,7 +71,7 @@ class FrameValidator:
         self._prompt: deque[tuple[float, int]] = deque()  # (host's time, device's frame number)
 
     def check(self, frame: TrackerFrame | None, now_s: float) -> FrameCheck:
-        """Judges the newest frame at `now_s`, seconds of the monotonic clock."""
+        """Checks the newest frame at `now_s`, seconds of the monotonic clock."""
         if frame is None:
             return FrameCheck(NO_FRAME)
         age_s = now_s - frame.monotonic_s
@@ -118,7 +118,7 @@ class FrameValidator:
         return max(0.0, delay_s)
 
     def content(self, frame: TrackerFrame) -> tuple[str, str, Array | None]:
-        """What is wrong with the poses, as a status and a detail, else the configuration (N, 3). Remembers nothing."""
+        """The status of the poses, its detail, and the configuration (N, 3) if the status is good. Keeps nothing."""
         count = self.robot.modules + 1
         if frame.poses.shape != (count, 4, 4) or len(frame.valid) != count:
             return WRONG_NUMBER, f"{len(frame.poses)}, expected {count}", None
@@ -151,7 +151,7 @@ class FrameValidator:
                 return SWAPPED, f"{_tool_name(worst)} and {_tool_name(worst + 1)}", None
             pairs = zip(_ahead_mm(frame.poses), self._rest_mm[1:], strict=True)
             behind = [-ahead > BEHIND * rest for ahead, rest in pairs]
-            if any(behind):  # all distances are those of a robot whose tools are told from tip to base
+            if any(behind):  # tools in the order from tip to base have the same distances
                 first = behind.index(True) + 1
                 return REVERSED, f"{_tool_name(first + 1)} behind {_tool_name(first)}", None
         return GOOD, "", configuration
@@ -186,7 +186,7 @@ class FrameValidator:
 
 
 class FaultCounter:
-    """Counts what is waited out, and raises when it has gone on for too long."""
+    """Counts bad frames and missed ticks in a row, and raises when there are too many."""
 
     def __init__(self, robot: Robot):
         self._invalid_frames = robot.limits.invalid_frames
@@ -194,7 +194,7 @@ class FaultCounter:
         self.missed_ticks = 0  # in a row
 
     def frame(self, check: FrameCheck) -> None:
-        """Raises `LostInRun` or `Tripped` at the last frame in a row that the robot file allows to be bad."""
+        """Raises `LostInRun` or `Tripped` at the number of bad frames in a row that the robot file sets."""
         if check.good:
             self.bad_frames = 0
             return
@@ -212,7 +212,7 @@ class FaultCounter:
         self.missed_ticks += ticks
         if self.missed_ticks > MISSED_IN_A_ROW:
             raise Tripped(
-                f"{self.missed_ticks} control ticks in a row were missed, at most {MISSED_IN_A_ROW} are waited out: "
+                f"{self.missed_ticks} control ticks in a row were missed, at most {MISSED_IN_A_ROW} are tolerated: "
                 "this computer is too busy, close other programs and start again"
             )
 
@@ -234,13 +234,13 @@ def check_actuation(raw: Array) -> None:
 
 def check_rest(configuration: Array, poses: Array) -> None:
     """Raises `Tripped` where the configuration (N, 3) and its poses (N + 1, 4, 4), base first, are not those of a robot
-    that hangs at rest: modules all but straight, each end further along than the one before, since tools in a wrong
-    order look straight too. The base's tool may sit anywhere on the base, so its place tells nothing."""
+    that hangs at rest: modules almost straight, each end further along than the one before, since tools in a wrong
+    order look straight too. The base's tool may be anywhere on the base, so its position is not checked."""
     bent = np.degrees(np.arccos(np.clip(configuration[:, 2], -1.0, 1.0)))
     if np.any(bent > REST_LIMIT_DEG):
         worst = int(np.argmax(bent))
         raise Tripped(
-            f"module {worst + 1} stands at {bent[worst]:.0f} degrees although the robot is vented, expected at most "
+            f"module {worst + 1} is at {bent[worst]:.0f} degrees although the robot is vented, expected at most "
             f"{REST_LIMIT_DEG:g}; are the tools in the order base, module 1, ... with z along the robot?"
         )
     ahead_mm = _ahead_mm(poses)

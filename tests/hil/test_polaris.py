@@ -155,8 +155,8 @@ def test_faults():
     device.take({"back": 0})
     assert device.answer(framed("TX:0801")) == (device.take({"corrupt": False}) or device.answer(framed("TX:0801")))
     device.take({"corrupt": True})
-    spoilt = device.answer(framed("TX:0801"))
-    assert spoilt[-5:-1] != f"{crc16(spoilt[:-5]):04X}".encode()
+    corrupted = device.answer(framed("TX:0801"))
+    assert corrupted[-5:-1] != f"{crc16(corrupted[:-5]):04X}".encode()
     device.take({"mute": True})
     assert device.answer(framed("TX:0801")) == b""
 
@@ -212,7 +212,7 @@ def test_a_file_in_the_place_of_the_port_stays(tmp_path):
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_tool_files_are_told_apart(tmp_path):
+def test_tool_files_differ(tmp_path):
     paths = write_tool_files(tmp_path, 3)
     assert [path.name for path in paths] == ["base.rom", "module-1.rom", "module-2.rom"]
     assert len({path.read_bytes() for path in paths}) == 3

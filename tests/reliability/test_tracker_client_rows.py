@@ -22,7 +22,7 @@ from modsoft.runtime.tracking.frame import FrameError
 from modsoft.runtime.tracking.ndi import NDI
 
 ANGLES_DEG = (10.0, 40.0, -30.0)
-PATIENCE_S = 120.0
+PATIENCE_S = 1500.0  # of 10^5 replies on a busy machine; the time-out of the test itself is shorter
 
 
 class Tracker:

@@ -22,19 +22,18 @@ RUN_S = 8 * PERIOD_S  # of a run before its fault
 def ended(world):
     """Runs until the tracker ends the run; seconds from the last good frame to the start of the venting."""
     good_s = []
-    world.loop.validator.check, validator = (
-        lambda *told: noted(validator(*told), told[0], good_s),
-        world.loop.validator.check,
-    )
+    check = world.loop.validator.check
+
+    def noted(frame, now_s):
+        result = check(frame, now_s)
+        if result.good:
+            good_s.append(frame.monotonic_s)
+        return result
+
+    world.loop.validator.check = noted
     with pytest.raises((LostInRun, Tripped)):
         world.run()
     return world.time_s - good_s[-1]
-
-
-def noted(check, frame, good_s):
-    if check.good:
-        good_s.append(frame.monotonic_s)
-    return check
 
 
 def held(world):
@@ -180,7 +179,7 @@ def test_row_16_nan(matrix_row, full):
     counts, frame = [], world.frame
 
     def sometimes(**changes):
-        """Two of three ticks see a frame that is spoilt somewhere."""
+        """Two of three ticks see a frame that is corrupted somewhere."""
         seen = frame(**changes)
         if int((world.time_s - 500.0 + 0.2) / PERIOD_S) % 3 == 0:
             return seen
@@ -288,22 +287,22 @@ def test_row_18_hidden_wrong_number_swapped(matrix_row, full):
 
 def test_row_19_numbers_backwards(matrix_row, full):
     rng, tries, used, dropped = np.random.default_rng(19), 1_000_000 if full else 20_000, 0, 0
-    slot, validator = LatestFrame(), FrameValidator(ROBOT)
+    frames, validator = LatestFrame(), FrameValidator(ROBOT)
     good, newest, last, now_s = planar_poses((1.0, 2.0, 3.0)), -1, -1, 1000.0
     for step in range(tries):
         now_s += 1 / 60
         back = rng.choice([0, rng.integers(1, 100), rng.integers(100, 60_000)], p=[0.5, 0.3, 0.2])
         number = int(now_s * 60) - back
         frame = TrackerFrame(number, now_s, good, np.ones(4, bool), np.full(4, 0.1), 60.0)
-        slot.put(frame)
+        frames.put(frame)
         dropped += number <= newest
         newest = max(newest, number)
-        seen = frame if step % 2 else slot.latest()  # the validator does not count on the slot
+        seen = frame if step % 2 else frames.latest()  # the validator does not depend on the filter
         if validator.check(seen, now_s + 0.001).good:
             used += seen.device_frame <= last
             last = seen.device_frame
-    assert slot.counts["repeated"] + slot.counts["backwards"] == dropped
-    assert sum(slot.counts.values()) == tries
+    assert frames.counts["repeated"] + frames.counts["backwards"] == dropped
+    assert sum(frames.counts.values()) == tries
     matrix_row(
         19,
         fault="frame numbers that go backwards",

@@ -1,4 +1,4 @@
-"""Which frames are used, what is waited out, and what ends a run."""
+"""Which frames are used, what is tolerated, and what ends a run."""
 
 import numpy as np
 import pytest
@@ -213,7 +213,7 @@ def test_a_delay_is_found_although_the_host_sees_fresh_frames():
     st.sampled_from([(0, 0), (1, 3), (2, 2), (0, 3)]),
     st.sampled_from([np.nan, np.inf, -np.inf]),
 )
-def test_what_is_not_finite_never_becomes_a_configuration(tool, entry, value):
+def test_pose_that_is_not_finite_is_refused(tool, entry, value):
     poses = planar_poses((5.0, 30.0, 80.0))
     poses[tool][entry] = value
     check = FrameValidator(ROBOT).check(frame(1, 1.0, poses=poses), 1.01)
@@ -229,10 +229,10 @@ def test_axes_too_large_for_a_length_are_distorted():
         assert FrameValidator(ROBOT).check(frame(1, 1.0, poses=poses), 1.01).status == safety.DISTORTED
 
 
-# ---- what is waited out
+# ---- What is tolerated
 
 
-def test_two_bad_frames_are_waited_out_and_the_third_ends_the_run():
+def test_third_bad_frame_in_a_row_ends_the_run():
     faults = FaultCounter(ROBOT)
     for _ in range(5):
         faults.frame(FrameCheck(safety.HIDDEN))
@@ -245,7 +245,7 @@ def test_two_bad_frames_are_waited_out_and_the_third_ends_the_run():
 
 
 @pytest.mark.parametrize("status", safety.TRACKER_LOST)
-def test_a_tracker_that_is_gone_is_lost_not_tripped(status):
+def test_lost_tracker_is_reported_as_lost(status):
     faults = FaultCounter(ROBOT)
     faults.frame(FrameCheck(status))
     faults.frame(FrameCheck(status))
@@ -265,16 +265,16 @@ def test_more_than_two_missed_ticks_end_the_run():
         FaultCounter(ROBOT).missed(8)
 
 
-# ---- what a model may answer, and how a robot may hang
+# ---- Actuations and rest
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 3.1, -40.0])
-def test_an_answer_that_means_nothing_is_refused(value):
+def test_actuation_out_of_range_is_refused(value):
     with pytest.raises(ModelError, match="nothing of it was sent"):
         check_actuation(np.array([[0.1], [value], [0.0]]))
 
 
-def test_an_answer_a_little_out_of_range_is_left_to_the_limits():
+def test_actuation_slightly_out_of_range_is_accepted():
     check_actuation(np.array([[1.2], [-1.2], [0.0]]))
 
 
@@ -285,7 +285,7 @@ def rest(poses):
 def test_rest():
     rest(planar_poses((0.0, 0.0, 0.0)))
     rest(planar_poses((3.0, 40.0, -59.0)))
-    with pytest.raises(Tripped, match="module 2 stands at 90 degrees"):
+    with pytest.raises(Tripped, match="module 2 is at 90 degrees"):
         rest(planar_poses((0.0, 90.0, 0.0)))
 
 
@@ -299,7 +299,7 @@ def test_a_straight_robot_with_its_tools_in_a_wrong_order_is_not_at_rest(order, 
         rest(poses[list(order)])
 
 
-def test_the_tool_of_the_base_may_sit_anywhere_on_it():
+def test_tool_of_the_base_may_be_anywhere_on_it():
     poses = planar_poses((0.0, 0.0, 0.0))
     poses[0, :3, 3] = [200.0, -30.0, 150.0]
     rest(poses)

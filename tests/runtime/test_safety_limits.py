@@ -251,7 +251,7 @@ def configuration(*z):
 def test_rounding_of_a_straight_or_reversed_module_is_no_error():
     with np.errstate(invalid="raise"):
         check_rest(configuration(1.0, 1.0 + 1e-9, 1.0), planar_poses(STRAIGHT))
-        with pytest.raises(Tripped, match="module 2 stands at 180 degrees"):
+        with pytest.raises(Tripped, match="module 2 is at 180 degrees"):
             check_rest(configuration(1.0, -1.0 - 1e-9, 1.0), planar_poses(STRAIGHT))
 
 
@@ -260,7 +260,7 @@ def test_bend_at_the_limit_is_at_rest(monkeypatch):
     monkeypatch.setattr(safety, "REST_LIMIT_DEG", np.degrees(np.arccos(0.5)))
     check_rest(bent, planar_poses(STRAIGHT))
     monkeypatch.setattr(safety, "REST_LIMIT_DEG", 59.9)
-    with pytest.raises(Tripped, match="module 2 stands at 60 degrees"):
+    with pytest.raises(Tripped, match="module 2 is at 60 degrees"):
         check_rest(bent, planar_poses(STRAIGHT))
 
 

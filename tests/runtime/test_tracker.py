@@ -1,4 +1,4 @@
-"""The slot, the reading thread, recorded frames, and what is said when a tracker is missing."""
+"""The holder of the newest frame, the reading thread, recorded frames, and the messages of a missing tracker."""
 
 import json
 import threading
@@ -24,31 +24,31 @@ def frame(number: int, at_s: float = 0.0, tools: int = 4) -> TrackerFrame:
     return TrackerFrame(number, at_s, np.tile(np.eye(4), (tools, 1, 1)), np.ones(tools, bool), np.full(tools, 0.1))
 
 
-def test_slot_holds_the_newest_and_counts_the_rest():
-    slot = LatestFrame()
-    assert slot.latest() is None
+def test_latest_holds_the_newest_and_counts_the_rest():
+    latest = LatestFrame()
+    assert latest.latest() is None
     for number in (5, 6, 6, 4, 9):
-        slot.put(frame(number))
-    assert slot.latest().device_frame == 9
-    assert slot.counts == {"received": 3, "repeated": 1, "backwards": 1}
+        latest.put(frame(number))
+    assert latest.latest().device_frame == 9
+    assert latest.counts == {"received": 3, "repeated": 1, "backwards": 1}
 
 
 def test_a_repeated_frame_does_not_become_younger():
-    slot = LatestFrame()
-    slot.put(frame(5, at_s=1.0))
-    slot.put(frame(5, at_s=2.0))
-    assert slot.latest().monotonic_s == 1.0
+    latest = LatestFrame()
+    latest.put(frame(5, at_s=1.0))
+    latest.put(frame(5, at_s=2.0))
+    assert latest.latest().monotonic_s == 1.0
 
 
 @given(st.lists(st.integers(0, 20)))
-def test_the_slot_never_goes_back(numbers):
-    slot = LatestFrame()
+def test_the_latest_never_goes_back(numbers):
+    latest = LatestFrame()
     seen = []
     for number in numbers:
-        slot.put(frame(number))
-        seen.append(slot.latest().device_frame)
+        latest.put(frame(number))
+        seen.append(latest.latest().device_frame)
     assert seen == list(np.maximum.accumulate(np.array(numbers, dtype=int)))
-    assert sum(slot.counts.values()) == len(numbers)
+    assert sum(latest.counts.values()) == len(numbers)
 
 
 class Scripted:
@@ -72,12 +72,12 @@ class Scripted:
 
 
 def test_reader_reads_and_closes_in_its_own_thread():
-    source, slot = Scripted([frame(1), None, frame(2)]), LatestFrame()
-    reader = Reader(source, slot)
+    source, latest = Scripted([frame(1), None, frame(2)]), LatestFrame()
+    reader = Reader(source, latest)
     assert source.given.wait(5)
     reader.close()
-    assert slot.latest().device_frame == 2
-    assert slot.error is None
+    assert latest.latest().device_frame == 2
+    assert latest.error is None
     assert source.closed_by == "tracker"
 
 
@@ -85,10 +85,10 @@ def test_reader_keeps_the_error_that_ended_it():
     def fail():
         raise OSError("cable")
 
-    source, slot = Scripted([frame(1)], fail), LatestFrame()
-    Reader(source, slot).close()
-    assert str(slot.error) == "cable"
-    assert slot.latest().device_frame == 1
+    source, latest = Scripted([frame(1)], fail), LatestFrame()
+    Reader(source, latest).close()
+    assert str(latest.error) == "cable"
+    assert latest.latest().device_frame == 1
     assert source.closed_by == "tracker"
 
 
@@ -170,7 +170,7 @@ def with_tracker(**changes):
     return robot_file.from_dict(table)
 
 
-def test_what_was_not_told_is_named(tmp_path):
+def test_missing_setting_is_named(tmp_path):
     with pytest.raises(UsageError, match="--tracker-port"):
         open_source(ROBOT, "", [])
     with pytest.raises(UsageError, match="--tracker-port"):
@@ -179,7 +179,7 @@ def test_what_was_not_told_is_named(tmp_path):
         open_source(ROBOT, "/dev/null", [])
 
 
-def test_what_is_not_there_is_named(tmp_path):
+def test_missing_device_is_named(tmp_path):
     tools = [tmp_path / f"{n}.rom" for n in range(4)]
     with pytest.raises(DeviceAbsent, match=r"0\.rom does not exist"):
         open_source(ROBOT, "/dev/null", tools)

@@ -94,7 +94,7 @@ class Pty:
         try:
             os.write(self.master, answer)
         except BlockingIOError:
-            pass  # nobody reads, as on a real line
+            pass  # no process reads, as on a real line
 
 
 class Network:

@@ -124,7 +124,7 @@ class Polaris:
             text = self._ascii(name, parameters)
         except Refused as refused:
             text = str(refused)
-        return self._sealed(text, spoilt=name == "TX")
+        return self._sealed(text, corrupted=name == "TX")
 
     def sent(self, reply: bytes) -> list[tuple[float, bytes]]:
         """The parts of a reply as the line sends them, each with a pause in seconds before it."""
@@ -132,8 +132,8 @@ class Polaris:
             return [(0.0, reply)]
         return self._damage.apply(reply)
 
-    def _sealed(self, text: str, spoilt: bool = False) -> bytes:
-        crc = crc16(text.encode()) ^ (0x5A5A if spoilt and self.faults.get("corrupt") else 0)
+    def _sealed(self, text: str, corrupted: bool = False) -> bytes:
+        crc = crc16(text.encode()) ^ (0x5A5A if corrupted and self.faults.get("corrupt") else 0)
         return f"{text}{crc:04X}\r".encode()
 
     def _ascii(self, name: str, parameters: str) -> str:
