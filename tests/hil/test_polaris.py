@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from modsoft.hil.byte_damage import KINDS, ByteDamage
 from modsoft.hil.polaris import Pty, write_tool_files
 from modsoft.hil.polaris_device import Polaris, crc16
-from modsoft.hil.rotations import quaternion
+from modsoft.hil.rotations import quaternion, turn, without_roll
 from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.tracking.frame import FrameError
 from modsoft.runtime.tracking.ndi import NDI
@@ -178,6 +179,97 @@ def test_frozen_and_delayed():
     assert device.tools() == frozen
     device.take({"freeze": False})
     assert device.tools() != frozen
+
+
+def test_status_rms_error_and_roll_of_a_tool():
+    device = Device().set_up(3)
+    device.take({"poses": poses(3), "rms_mm": {"1": 5.0}, "port_status": {"2": 0x71}})
+    text = device.ask("TX:0801")
+    rows = text[2:].split("\n")[:3]
+    assert [row[47:53] for row in rows] == ["+01000", "+50000", "+01000"]
+    assert [row[-16:-8] for row in rows] == ["00000031", "00000031", "00000071"]
+    turned = np.eye(4)
+    turned[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # 90 degrees about z
+    device.take({"poses": [turned.tolist()] * 3, "five_dof": [0]})
+    quaternions = [transform[:24] for _, transform, _ in device.tools()]
+    assert quaternions == ["+10000+00000+00000+00000", *["+07071+00000+00000+07071"] * 2]
+
+
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3))
+def test_without_roll_keeps_the_direction_of_the_tool(values):
+    q = tuple(np.array(values) / np.linalg.norm(values))
+    w, x, y, z = without_roll(q)
+    assert z == 0.0
+    assert w * w + x * x + y * y == pytest.approx(1.0)
+    np.testing.assert_allclose(np.array(turn((w, x, y, z)))[:, 2], np.array(turn(q))[:, 2], atol=1e-9)
+
+
+def test_other_frame_rate():
+    device = Device(frame_hz=20.0).set_up(1)
+    before = device.tools()[0][2]
+    device.time_s += 10.0
+    assert device.tools()[0][2] == before + 200
+
+
+def test_aurora_is_turned_as_a_whole():
+    """Every tool has some roll, which a tool of five degrees of freedom never has."""
+    device = Device(kind="aurora", wired=2)
+    assert device.ask("INIT:") == "OKAY"
+    for handle in ("0A", "0B"):
+        device.ask(f"PINIT:{handle}")
+        device.ask(f"PENA:{handle}D")
+    device.ask("TSTART:")
+    device.take({"poses": poses(2)})
+    first, second = (transform for _, transform, _ in device.tools())
+    assert first[:24] == second[:24]
+    assert int(first[18:24]) != 0
+
+
+REPLY = b"0A" + bytes(range(48, 58)) * 5 + b"\r"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damage_is_of_its_kind_and_the_same_for_a_seed(kind):
+    damage, again = (ByteDamage(seed=1, kinds=[kind]) for _ in range(2))
+    for _ in range(200):
+        parts = damage.apply(REPLY)
+        assert parts == again.apply(REPLY)
+        sent = b"".join(part for _, part in parts)
+        changed = [a ^ b for a, b in zip(sent, REPLY, strict=False) if a != b]
+        match kind:
+            case "flip":
+                assert len(sent) == len(REPLY)
+                assert len(changed) <= 3
+            case "bit 7":
+                assert set(changed) <= {0x80}
+                assert len(sent) == len(REPLY)
+            case "drop":
+                assert len(REPLY) - 3 <= len(sent) < len(REPLY)
+            case "insert":
+                assert len(REPLY) < len(sent) <= len(REPLY) + 3
+            case "no return":
+                assert sent == REPLY[:-1]
+            case "delay":
+                assert sent == REPLY
+                assert all(0 <= pause_s <= 0.01 for pause_s, _ in parts)
+
+
+def test_damage_has_a_rate_and_known_kinds():
+    damage = ByteDamage(seed=2, rate=0.25, kinds=["drop"])
+    damaged = sum(damage.apply(REPLY) != [(0.0, REPLY)] for _ in range(1000))
+    assert 200 < damaged < 300
+    with pytest.raises(ValueError, match="melt"):
+        ByteDamage(seed=1, kinds=["melt"])
+
+
+def test_only_replies_while_tracking_are_damaged():
+    device = Device()
+    device.take({"damage": {"seed": 1, "kinds": ["no return"]}})
+    assert device.sent(device.answer(b"INIT:E3A5")) == [(0.0, b"OKAYA896\r")]
+    device.set_up(1)
+    assert not device.sent(device.answer(framed("TX:0801")))[-1][1].endswith(b"\r")
+    device.take({"damage": None})
+    assert device.sent(device.answer(framed("TX:0801")))[-1][1].endswith(b"\r")
 
 
 def test_an_unknown_fault_is_an_error():

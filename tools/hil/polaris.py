@@ -1,32 +1,32 @@
-"""A fake Polaris: an optical tracker of passive tools on a pseudo-terminal, in a process of its own.
+"""A fake tracker of passive tools on a pseudo-terminal, in a process of its own.
 
 `python -m modsoft.hil.polaris --link PATH` makes PATH a serial port that speaks the device's ASCII protocol (and its
-binary `BX` answer) well enough for the unmodified scikit-surgerynditracker. With `--type vega` it is on a port of the
-network of this machine alone, in place of PATH; with `--type aurora` and `--wired N` it has N wired tools. A process
-of its own, because that client holds its interpreter while it looks for a device. Standard input, one JSON object a
-line, any keys together; its end ends the process:
+binary `BX` answer) well enough for the unmodified scikit-surgerynditracker. With `--type vega` it is on a network
+port of this machine instead of PATH; with `--type aurora` and `--wired N` it has N wired tools. It is a process because
+that client holds the interpreter lock while it looks for a device. Standard input has one JSON object a line with any
+of these keys, and its end ends the process:
 
-    {"poses": [[4 x 4], ...]}  poses of the tools, base first, mm, in the tracker's frame; the newest is shown
+    {"poses": [[4 x 4], ...]}  poses of the tools, base first, mm, in the tracker's frame; the newest are reported
     {"hide": [k, ...]}         tools that are missing from now on (0 is the base); [] shows all again
-    {"lose": [k, ...]}         tools that are left out of the answer altogether
-    {"freeze": true}           the same frame, number included, again and again
+    {"lose": [k, ...]}         tools that are not in the reply
+    {"freeze": true}           the same frame and number again
     {"delay_s": s}             frames and their numbers are this old
     {"back": n}                frame numbers n smaller
-    {"jump": {"tool": k, "mm": [x, y, z], "deg": d}}   tool k is seen there, turned about its own x axis; null ends it
-    {"swap": [j, k]}           two tools are taken for each other; null ends it
-    {"corrupt": true}          a wrong checksum on every answer to TX and BX
+    {"jump": {"tool": k, "mm": [x, y, z], "deg": d}}   tool k is moved and turned about its own x axis; null ends it
+    {"swap": [j, k]}           two tools are swapped; null ends it
+    {"corrupt": true}          a wrong checksum in every reply to TX and BX
     {"damage": {"seed": n, "rate": r, "kinds": [...]}}   bytes of replies flipped, dropped, inserted, delayed while it
                                tracks (`modsoft.hil.byte_damage`); null ends it
     {"rms_mm": {"k": e}}       tool k is measured with this RMS error; {} ends it
     {"port_status": {"k": n}}  tool k has this port status; {} ends it
     {"five_dof": [k, ...]}     tools whose roll is not measured
-    {"mute": true}             no answer to anything
+    {"mute": true}             no reply
     {"unplug": true}           the port goes away; false brings it back
 
 Standard output, one JSON line each: {"event": "ready", "port": PATH or ADDRESS}, {"event": "tracking", "mono_ns"} at
 every TSTART, {"event": "summary", "commands": {name: count}, "frames"} at the end.
 
-Answers take their time on a line of 115200 baud.
+Replies take the time of a line of 115200 baud, unless `--unpaced`.
 """
 
 from __future__ import annotations
@@ -87,12 +87,12 @@ class Pty:
         *whole, self._pending = (self._pending + os.read(self.master, 4096)).split(b"\r")
         return whole
 
-    def write(self, answer: bytes) -> None:
-        """Sends an answer in the time that the line needs for it."""
+    def write(self, reply: bytes) -> None:
+        """Sends a reply in the time of the line."""
         if self._seconds_a_byte:
-            time.sleep(len(answer) * self._seconds_a_byte)
+            time.sleep(len(reply) * self._seconds_a_byte)
         try:
-            os.write(self.master, answer)
+            os.write(self.master, reply)
         except BlockingIOError:
             pass  # no process reads, as on a real line
 
@@ -138,10 +138,10 @@ class Network:
         *whole, self._pending = (self._pending + data).split(b"\r")
         return whole
 
-    def write(self, answer: bytes) -> None:
+    def write(self, reply: bytes) -> None:
         if self._client is not None:
             with contextlib.suppress(ConnectionError):
-                self._client.sendall(answer)
+                self._client.sendall(reply)
 
     def _await_client(self) -> None:
         self._client = None

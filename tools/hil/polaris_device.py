@@ -1,10 +1,10 @@
-"""The fake Polaris without its line: commands in, answers out, on an injected clock. `modsoft.hil.polaris` documents
+"""The fake tracker without its line: commands in, replies out, on an injected clock. `modsoft.hil.polaris` documents
 the faults and puts it behind a serial port.
 
-It is a Vega, too, and an Aurora, which has no tool files: what is wired to it has a handle from the start.
-Resolution is the device's own: TX gives positions in 0.01 mm and quaternions in 1e-4, BX single floats. Frame numbers
-run at the device's rate whatever the poses do. It is as strict as the device where a wrong order of calls would go
-unnoticed otherwise: only enabled tools are reported, and none before TSTART.
+It is a Polaris, a Vega, or an Aurora, whose wired tools have a handle from the start and need no tool files. The
+resolution is the device's: TX has positions in 0.01 mm and quaternions in 1e-4, BX has single floats. Frame numbers run
+at the device's rate, with or without new poses. A wrong order of calls is an error as on the device: only enabled tools
+are reported, and none before TSTART.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from modsoft.hil.byte_damage import ByteDamage
 from modsoft.hil.rotations import Pose, quaternion, seen_from, turn, turned, without_roll
 
 FRAME_HZ = {"polaris": 60.0, "vega": 60.0, "aurora": 40.0}  # as in NDI's API guides
-AURORA_TURN = (0.9, 0.2, 0.25, 0.3)  # a field generator stands anywhere: no tool has a rotation without roll
+AURORA_TURN = (0.9, 0.2, 0.25, 0.3)  # quaternion of the field generator, in any position: each tool has some roll
 FIRST_HANDLE = 0x0A  # as the wireless tools of the device: a handle is no index
 BX_START = 0xA5C4
-# Answer status, and error codes of the protocol.
+# Status of a tool in BX, and error codes of the protocol.
 VALID, MISSING = 0x01, 0x02
 BAD_COMMAND, BAD_CRC, BAD_HANDLE, WRONG_MODE = 0x01, 0x04, 0x08, 0x0C
 NO_TOOL, NOT_INITIALISED, NO_SYSTEM = 0x0D, 0x0E, 0x10
@@ -52,7 +52,7 @@ def crc16(data: bytes) -> int:
 
 
 class Refused(Exception):
-    """The device answers ERROR with this code."""
+    """The device replies ERROR with this code."""
 
     def __init__(self, code: int):
         super().__init__(f"ERROR{code:02X}")
@@ -60,7 +60,7 @@ class Refused(Exception):
 
 
 class Polaris:
-    """The device without its line: commands in, answers out. `now` is a monotonic clock in seconds."""
+    """The device without its line: commands in, replies out. `now` is a monotonic clock in seconds."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class Polaris:
         wired: int = 0,
         frame_hz: float | None = None,
     ):
-        """`firmware`: with "Rev 007" at its end the client asks for TX in place of BX. `kind`: as in the robot file;
+        """`firmware`: with "Rev 007" at its end the client requests TX instead of BX. `kind`: as in the robot file;
         `wired`: number of tools that need no definition file; `frame_hz`: of the frame numbers, if not that of the
         kind."""
         self.now = now
@@ -107,7 +107,7 @@ class Polaris:
             self._frozen = self._frame()
 
     def answer(self, command: bytes) -> bytes:
-        """The answer to one command, without its carriage return; empty from a mute device."""
+        """The reply to one command, given without its carriage return; empty from a mute device."""
         name, colon, parameters = command.decode("ascii", "replace").partition(":")
         if not colon:
             name, _, parameters = command.decode("ascii", "replace").partition(" ")
@@ -120,11 +120,11 @@ class Polaris:
                 if crc != f"{crc16(command[:-4]):04X}":
                     raise Refused(BAD_CRC)
             if name == "BX":
-                return self._bx(self._asked(parameters))
+                return self._bx(self._reported(parameters))
             text = self._ascii(name, parameters)
         except Refused as refused:
             text = str(refused)
-        return self._sealed(text, corrupted=name == "TX")
+        return self._with_checksum(text, corrupted=name == "TX")
 
     def sent(self, reply: bytes) -> list[tuple[float, bytes]]:
         """The parts of a reply as the line sends them, each with a pause in seconds before it."""
@@ -132,14 +132,14 @@ class Polaris:
             return [(0.0, reply)]
         return self._damage.apply(reply)
 
-    def _sealed(self, text: str, corrupted: bool = False) -> bytes:
+    def _with_checksum(self, text: str, corrupted: bool = False) -> bytes:
         crc = crc16(text.encode()) ^ (0x5A5A if corrupted and self.faults.get("corrupt") else 0)
         return f"{text}{crc:04X}\r".encode()
 
     def _ascii(self, name: str, parameters: str) -> str:
         if name == "INIT":
             self._initialised, self.tracking = True, False
-            self._tools = dict(self._wired)  # the client counts on that when it connects again
+            self._tools = dict(self._wired)  # the client requires this when it connects again
             return "OKAY"
         if name == "GETINFO":
             return f"{parameters}=009.000;1;0;1;;;{parameters}"
@@ -148,7 +148,7 @@ class Polaris:
         if not self._initialised:
             raise Refused(NO_SYSTEM)
         if name == "TX":
-            return self._tx(self._asked(parameters))
+            return self._tx(self._reported(parameters))
         if name == "TSTOP":
             self.tracking = False
             return "OKAY"
@@ -193,8 +193,8 @@ class Polaris:
             self._tools[handle] = "enabled"
         return "OKAY"
 
-    def _asked(self, parameters: str) -> list[tuple[int, Pose | None, int]]:
-        """What TX and BX report: (handle, pose or None, frame number) of every enabled tool."""
+    def _reported(self, parameters: str) -> list[tuple[int, Pose | None, int]]:
+        """The content of TX and BX: (handle, pose or None, frame number) of every enabled tool."""
         if parameters not in ("", "0001", "0801"):
             raise Refused(BAD_COMMAND)
         if not self.tracking:
@@ -247,7 +247,7 @@ class Polaris:
         return text + "0000"
 
     def _of_tool(self, fault: str, tool: int, otherwise: Any) -> Any:
-        """What a fault of the form {tool: value} has for this tool."""
+        """The value for this tool in a fault of the form {tool: value}."""
         return (self.faults.get(fault) or {}).get(str(tool), otherwise)
 
     def _bx(self, rows: list[tuple[int, Pose | None, int]]) -> bytes:
