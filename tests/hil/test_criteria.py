@@ -276,3 +276,29 @@ def test_tracking_has_limits_by_task_and_modules(reference, monkeypatch):
 def test_percentiles_are_measured_values():
     assert criteria.p99(np.array([1.0, 2.0, 50.0])) == 50.0
     assert math.isnan(criteria.p99(np.array([])))
+
+
+@pytest.fixture
+def real_board(monkeypatch):
+    """The reference run with a real board: a STATUS, in 10 Pa, takes the place of each change of a register."""
+    monkeypatch.setattr("reference_run.COUNTS", 30_000)
+    return replace(reference_run(), sees_registers=False, outputs_age_ms=120.0, board_late_ms=math.nan)
+
+
+def test_run_with_a_real_board_passes_without_what_it_cannot_see(real_board):
+    unseen = replace(real_board, board_dropped_bytes=math.nan, board_slipped_percent=math.nan)
+    assessment = assess(unseen)
+    assert str(assessment) == "passed"
+    not_seen = {line.name for line in assessment.criteria if line.met is None}
+    assert {line.measured for line in assessment.criteria if line.met is None} == {"not seen"}
+    assert {"largest valve output", "resets in the run", "watchdog resets"} < not_seen
+    assert len(not_seen) == 9
+    assert [line.name for line in assessment.host_load_checks] == ["simulated robot behind real time"]
+
+
+def test_real_board_that_reports_another_pressure_fails(real_board):
+    off = real_board.outputs._replace(duty=real_board.outputs.duty + 5 / 30_000)
+    assessment = assess(replace(real_board, outputs=off))
+    assert "applied pressures, as reported: largest difference from the settled set-point 0.5" in assessment.reason
+    assert "applied pressures, as reported: all 0, after the vent began inf ms" in assessment.reason
+    assert "valve outputs" not in assessment.reason

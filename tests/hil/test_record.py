@@ -75,3 +75,16 @@ def test_the_slew_is_the_slower_one(run_folder, board, expected):
 
 def test_the_firmware_has_a_hash_on_either_board():
     assert len(record.firmware_sha256("native")) == 64
+
+
+def test_reports_of_a_real_board_take_the_place_of_registers(run_folder, tmp_path):
+    run_folder()
+    serial = {"event": "serial", "channels": 3, "p_full": 30_000, "t_us": 0.0, "mono_ns": 0}
+    status = {"event": "status", "t_us": 1e3, "mono_ns": 1_000_000, "applied": [3000, 1500, 0] + [0] * 9}
+    (tmp_path / "board.jsonl").write_text("".join(json.dumps(event) + "\n" for event in (serial, status)))
+    run = record.read(tmp_path, tmp_path, robot_file.load("pneumatic-3"), "down", np.zeros((2, 3, 3)), 79)
+    assert (run.sees_registers, run.outputs_age_ms, run.outputs.counts) == (False, 120.0, 30_000)
+    np.testing.assert_allclose(run.outputs.duty, [[0.1, 0.05, 0.0]])
+    (tmp_path / "board.jsonl").write_text(json.dumps(serial) + "\n")
+    silent = record.read(tmp_path, tmp_path, robot_file.load("pneumatic-3"), "down", np.zeros((2, 3, 3)), 79)
+    assert criteria.assess(silent).outcome == "failed"

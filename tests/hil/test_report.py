@@ -118,3 +118,11 @@ def test_plot_names_its_units(record):
     lines = figure.axes[1].get_lines()
     np.testing.assert_allclose(lines[2].get_ydata()[-1], -20.0)  # desired of module 2
     np.testing.assert_allclose(lines[1].get_ydata()[-1], -22.0)  # measured
+
+
+def test_report_of_a_real_board_states_what_it_did_not_see(record):
+    real = replace(record, sees_registers=False, outputs_age_ms=120.0)
+    text = report.text(real, assess(real), {}, report.figures(real))
+    assert "| watchdog resets | not seen | 0 | not seen |" in text
+    assert "Not seen in this run, because the board is a real one" in text
+    assert "electromagnetic" not in text

@@ -14,12 +14,15 @@ import click
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import load_task
 from modsoft.runtime.entry_point import entry
-from modsoft.runtime.errors import DeviceAbsent
+from modsoft.runtime.errors import DeviceAbsent, UsageError
 from modsoft.runtime.locks import system_module
+from modsoft.runtime.robot import Robot
 
 if TYPE_CHECKING:
+    from modsoft.hil.board.serial_board import SerialBoard
     from modsoft.hil.rig import Rig
 
+EMULATED = ("auto", "simavr", "native")
 RUN_MARGIN_S = 60.0  # for start, arming, venting and closing of the runtime, beyond its ticks
 SETTLE_S = 1.5  # the traces continue for so long after the runtime, until the chambers are empty
 
@@ -37,28 +40,37 @@ SETTLE_S = 1.5  # the traces continue for so long after the runtime, until the c
 @click.option(
     "--board",
     default="auto",
-    type=click.Choice(["auto", "simavr", "native"]),
+    metavar="auto|simavr|native|PORT",
     help="simavr: the compiled firmware on an emulated ATmega2560. native: its logic compiled for this "
-    "machine. auto: simavr where it is installed.",
+    "machine. auto: simavr where it is installed. PORT: a real MEGA at a serial port, such as /dev/ttyACM0, or with "
+    "this USB serial number.",
 )
+@click.option("--yes", is_flag=True, help="With a real board: start without asking.")
 @click.option("--steps", type=click.IntRange(1), help="Run only so many control steps.  [default: the whole task]")
-def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps: int | None) -> int:
+def cli(robot_file: str, model: Path, task: str, report: Path, board: str, yes: bool, steps: int | None) -> int:
     """Run a controller in real time on emulated hardware and check the run against its criteria.
 
     \b
-    Example:
+    Examples:
       modsoft-hil --robot pneumatic-3 --model model.onnx --task down --report out
+      modsoft-hil --robot pneumatic-3 --model model.onnx --task down --report out --board /dev/ttyACM0
+
+    With a real board the air must be off, or the robot disconnected: its valve outputs follow the task. The simulated
+    robot follows the pressures that the board reports as applied. The board must be flashed with SENSORS=0. The report
+    states what such a run cannot see: timer registers, resets, the watchdog, voltages at the pins.
 
     \b
     Exit code:
-      0    passed: every criterion is met
+      0    passed: every criterion that the run could see is met
       1    failed: one is not met
       3    inconclusive: the host was too slow, or the run shorter than 100 control steps
-    Others are those of modsoft-runtime (64 robot file, 65 model, 69 something is missing, ...).
+    Others are those of modsoft-runtime (64 robot file, 65 model, 69 something is missing, 75 port in use, 76 board of
+    another version or for other hardware, ...).
 
     The folder gets report.md, report.json, angles.png, run.jsonl (the runtime's log), board.jsonl (timer registers of
-    the emulated board) and plant.jsonl (the simulated robot). Run nothing else on the machine meanwhile. An
-    interrupted run leaves its traces there and no report; the next run into this folder replaces them.
+    the emulated board, or messages of the real one) and plant.jsonl (the simulated robot). Run nothing else on the
+    machine meanwhile. An interrupted run leaves its traces there and no report; the next run into this folder replaces
+    them.
     """
     _check_system()
     from tqdm import tqdm
@@ -69,7 +81,6 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
         report_folder,
     )
     from modsoft.hil import report as reports
-    from modsoft.hil.board.toolchain import build, choose
     from modsoft.hil.plant import load_robot
     from modsoft.hil.rig import Rig
 
@@ -79,11 +90,11 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     Model.load(model).check(robot)  # the runtime does it too; here it fails before the rig starts
     desired = desired[:steps]
     count = len(desired)
-    build(choose(board))
+    rig_board = _prepared_board(board, robot, yes)
 
     options = [] if steps is None else ["--steps", str(steps)]
     with report_folder.claimed(report):
-        rig = Rig(robot_file, report, board)
+        rig = Rig(robot_file, report, rig_board)
         try:
             with rig:
                 rig.run(model, task, *options)
@@ -98,7 +109,8 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     if no_picture := reports.write(run, assessment, about, report):
         click.echo(f"modsoft-hil: {no_picture}", err=True)
     for line in [*assessment.criteria, *assessment.host_load_checks]:
-        click.echo(f"{'ok' if line.met else 'NO':>4}  {line.name}: {line.measured} ({line.limit})")
+        met = "--" if line.met is None else "ok" if line.met else "NO"
+        click.echo(f"{met:>4}  {line.name}: {line.measured} ({line.limit})")
     if run.runtime_exit:
         click.echo(f"last line of modsoft-runtime: {run.runtime_message or 'none'}")
     click.echo(f"{assessment}\n{report / 'report.md'}")
@@ -106,18 +118,44 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, steps
     return run.runtime_exit if run.runtime_exit and not len(run.tick) else assessment.exit_code
 
 
+def _prepared_board(board: str, robot: Robot, yes: bool) -> str | SerialBoard:
+    """The board for the rig: an emulated one is built; a real one is checked, after a confirmation."""
+    from modsoft.hil.board.serial_board import SerialBoard
+    from modsoft.hil.board.toolchain import build, choose
+
+    if board in EMULATED:
+        build(choose(board))
+        return board
+    real = SerialBoard(board, robot)
+    click.echo(f"{board}: its valve outputs will follow the task: turn off the air, or disconnect the robot", err=True)
+    if not yes:
+        if not sys.stdin.isatty():
+            raise UsageError(f"--board {board} needs a confirmation, and standard input is no terminal; give --yes")
+        click.confirm("Is the air off, or the robot disconnected?", abort=True, err=True)
+    real.check()
+    return real
+
+
 def _about(rig: Rig, robot_file: str, model: Path, task: str, steps: int | None, count: int) -> dict[str, str]:
     """What ran, for the report. steps: of the option; count: control steps of the run."""
     from modsoft.hil import record
+    from modsoft.hil.board.serial_board import SerialBoard
 
     robot, board = rig.robot, rig.board
+    if isinstance(board, SerialBoard):
+        hello, firmware = board.hello, "not seen"
+        description = (
+            f"real board at {board.board}, firmware version {hello.firmware_version}, {hello.channels} channels"
+        )
+    else:
+        description, firmware = record.board_description(board.board), record.firmware_sha256(board.board)
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": f"modsoft-hil --robot {Path(robot_file).name} --model {model.name} --task {Path(task).name} "
         f"--board {board.board}" + (f" --steps {steps}" if steps else ""),
-        "board": record.board_description(board.board),
+        "board": description,
         "board's clock": board.clock,
-        "firmware, SHA-256": record.firmware_sha256(board.board),
+        "firmware, SHA-256": firmware,
         "model, SHA-256": hashlib.sha256(model.read_bytes()).hexdigest(),
         "robot": f"{robot.name}, {robot.modules} modules, {robot.loop.hz:g} Hz",
         "task": f"{task}, {count} control steps",

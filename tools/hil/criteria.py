@@ -32,6 +32,7 @@ MISSED_TICKS = 0
 HELD_TICKS = 0
 LATENESS_P99_MS = LATE_MS
 VALVE_COUNTS = 1.0  # of the timer: a set-point is rounded to counts once
+APPLIED_UNITS = 1.0  # of the protocol, 10 Pa: a set-point is rounded to units once
 DROPPED_BYTES = 0
 CHAMBERS_AT_END_BAR = 0.02
 DESIRED_ERROR = 1e-9  # of a component: the log rounds to nine digits
@@ -53,12 +54,13 @@ PLANT_LATE_MS = 100.0
 
 
 class Criterion(NamedTuple):
-    """One criterion with its measured value. `timing` criteria are void on a host that did not keep up."""
+    """One criterion with its measured value. `timing` criteria are void on a host that did not keep up. met: None where
+    the run could not see the value."""
 
     name: str
     measured: str
     limit: str
-    met: bool
+    met: bool | None
     timing: bool = False
 
 
@@ -151,8 +153,40 @@ def loop_criteria(record: Record) -> list[Criterion]:
     ]
 
 
+def not_seen(line: Criterion) -> Criterion:
+    """The criterion in a run that cannot see its value."""
+    return line._replace(measured="not seen", met=None)
+
+
 def valve_criteria(record: Record) -> list[Criterion]:
-    """The valve outputs, from the timer registers, against the logged set-points."""
+    """The valve outputs against the logged set-points: from the timer registers, or, with a real board, from its
+    reports; and the venting that it reports."""
+    vented = Criterion("vented, as reported by the board", _yes(record.reported_vented), "yes", record.reported_vented)
+    if record.sees_registers:
+        return [*register_criteria(record), vented]
+    return [*map(not_seen, register_criteria(record)), *reported_criteria(record), vented]
+
+
+def reported_criteria(record: Record) -> list[Criterion]:
+    """The applied pressures that a real board reports, against the logged set-points. A count is 10 Pa."""
+    assert record.robot.valve is not None  # the rig runs no other robots
+    scale_bar = record.robot.valve.full_scale_bar / record.outputs.counts
+    in_bar = {
+        "largest difference from the settled set-point": _largest(valve_difference(record)),
+        "largest distance outside old and new set-point": _largest(valve_excursion(record)),
+        "largest before the first set-point": largest_duty_before(record) * record.outputs.counts,
+    }
+    name, limit = "applied pressures, as reported", f"at most {APPLIED_UNITS * scale_bar * 1e3:g} mbar"
+    lines = [
+        Criterion(f"{name}: {what}", f"{units * scale_bar * 1e3:.3g} mbar", limit, bool(units <= APPLIED_UNITS))
+        for what, units in in_bar.items()
+    ]
+    vented_ms = record.outputs.vented_after_ms(record.end_us)
+    return [*lines, at_most(f"{name}: all 0, after the vent began", vented_ms, vent_limit_ms(record), " ms")]
+
+
+def register_criteria(record: Record) -> list[Criterion]:
+    """The valve outputs, from the timer registers."""
     differences = valve_difference(record)
     highest = float(np.max(record.outputs.duty, initial=0.0)) * record.outputs.counts
     allowed = round(record.robot.valve.p_max_bar * full_counts_per_bar(record), 2) if record.robot.valve else 0.0
@@ -173,7 +207,6 @@ def valve_criteria(record: Record) -> list[Criterion]:
         at_most("largest valve output", highest, allowed + VALVE_COUNTS, " counts"),
         at_most("largest duty before the first set-point", largest_duty_before(record), 0.0),
         at_most("ticks without time for the valves to settle", int(np.isnan(differences).sum()), 0),
-        Criterion("vented, as reported by the board", _yes(record.reported_vented), "yes", record.reported_vented),
         at_most("all valve outputs at 0, after the vent began", vented_ms, vent_limit_ms(record), " ms"),
     ]
 
@@ -185,13 +218,16 @@ def board_criteria(record: Record) -> list[Criterion]:
     watchdogs = sum(event["event"] == "watchdog" for event in record.board_events)
     faults = [f"0x{value:04x}" for value in np.unique(record.faults[record.faults != 0])]
     not_running = [state for state in record.state if state != "RUNNING"]
-    return [
+    reported = [
         Criterion("faults of the board", ", ".join(faults) or "none", "none", not faults),
         at_most("ticks with the board not RUNNING", len(not_running), 0),
+    ]
+    emulated = [
         at_most("resets in the run", sum(event["event"] == "reset" for event in in_run), 0),
         at_most("watchdog resets", watchdogs, 0),
         at_most("bytes dropped by the board's receiver", record.board_dropped_bytes, DROPPED_BYTES),
     ]
+    return [*reported, *(emulated if record.sees_registers else map(not_seen, emulated))]
 
 
 def robot_criteria(record: Record) -> list[Criterion]:
@@ -216,18 +252,22 @@ def _yes(value: bool) -> str:
 def host_load_checks(record: Record) -> list[Criterion]:
     """Whether the board and the simulated robot ran in real time."""
     plant_ms = float(np.max(record.plant_late_ms)) if len(record.plant_late_ms) else math.nan
+    plant = at_most("simulated robot behind real time", plant_ms, PLANT_LATE_MS, " ms")
+    if not record.sees_registers:  # a real board is always in real time
+        return [plant]
     return [
         at_most("emulated board behind real time", record.board_late_ms, BOARD_LATE_MS, " ms"),
         at_most("time lost to stalls of the board", record.board_slipped_percent, BOARD_SLIPPED_PERCENT, " %"),
-        at_most("simulated robot behind real time", plant_ms, PLANT_LATE_MS, " ms"),
+        plant,
     ]
 
 
 def assess(record: Record) -> Assessment:
-    """Passed when every criterion is met, on a host that kept up, in a run of at least `MIN_TICKS`."""
+    """Passed when every criterion that the run could see is met, on a host that kept up, in a run of at least
+    `MIN_TICKS`."""
     lines, host_load = criteria(record), host_load_checks(record)
     slow = [line for line in host_load if not line.met]
-    unmet = [line for line in lines if not line.met and not (line.timing and slow)]
+    unmet = [line for line in lines if line.met not in (True, None) and not (line.timing and slow)]
     if unmet:
         return Assessment("failed", "; ".join(f"{line.name} {line.measured}" for line in unmet), lines, host_load)
     if slow:

@@ -62,6 +62,20 @@ def read_outputs(events: Sequence[Event]) -> ValveOutputs:
     )
 
 
+def read_reported(events: Sequence[Event]) -> ValveOutputs:
+    """The applied pressures of a real board by its STATUS, a row for each, times of arrival. A full duty is the full
+    scale of the valves, so that a count is the unit of the protocol, 10 Pa."""
+    hello = next(event for event in events if event["event"] == "serial")
+    reports = [event for event in events if event["event"] == "status"]
+    applied = np.array([event["applied"][: hello["channels"]] for event in reports], dtype=np.float64)
+    return ValveOutputs(
+        np.array([event["mono_ns"] for event in reports], dtype=np.int64),
+        np.array([event["t_us"] for event in reports], dtype=np.float64),
+        applied.reshape(len(reports), hello["channels"]) / hello["p_full"],
+        hello["p_full"],
+    )
+
+
 def emulated_us(events: Sequence[Event], mono_ns: float) -> float:
     """An instant of CLOCK_MONOTONIC in emulated time, by the last event before it; NaN before the first event."""
     before = [event for event in events if event["mono_ns"] <= mono_ns]

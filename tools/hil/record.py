@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.hil.board.toolchain import FIRMWARE, FIRMWARE_ELF
-from modsoft.hil.outputs import ValveOutputs, emulated_us, read_outputs
+from modsoft.hil.outputs import ValveOutputs, emulated_us, read_outputs, read_reported
 from modsoft.runtime import log_reader
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.board.protocol import CHANNELS, to_bar
+from modsoft.runtime.board.protocol import CHANNELS, STATUS_PERIOD_MS, to_bar
 from modsoft.runtime.log_record import TickRecord
 from modsoft.runtime.robot import Robot
 
 Line = dict[str, Any]
 
+REPORT_AGE_MS = STATUS_PERIOD_MS + 20.0  # of a STATUS in force: its period, transfer and forwarding
 LATE_BOUND_MS = 20.0  # board.c: beyond it emulated time is shifted, with an event `late`
 
 
@@ -62,6 +63,9 @@ class Record:
     plant_configuration: Array  # (M, N, 3)
     plant_bar: Array  # (M, N, 2)
     plant_late_ms: Array  # of the slices in the run
+    # A real board shows no registers: `outputs` are the applied pressures of its STATUS, of at most this age.
+    sees_registers: bool = True
+    outputs_age_ms: float = 0.0
 
     @property
     def steps(self) -> int:
@@ -83,6 +87,7 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, reference: Arr
     start_ns = ticks[0].mono_ns if ticks else math.inf
     end_ns = end.mono_ns if end else ticks[-1].mono_ns if ticks else -1
     summary = next((event for event in events if event["event"] == "summary"), {})
+    is_real = any(event["event"] == "serial" for event in events)
     count, modules = len(ticks), robot.modules
     messages = (folder / "runtime.err").read_text(errors="replace").strip().splitlines()
     return Record(
@@ -111,7 +116,9 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, reference: Arr
         end_ns=end_ns,
         end_us=emulated_us(events, end_ns),
         reported_vented=bool(end and end.vented),
-        outputs=read_outputs(events),
+        outputs=read_reported(events) if is_real else read_outputs(events),
+        sees_registers=not is_real,
+        outputs_age_ms=REPORT_AGE_MS if is_real else 0.0,
         board_events=[event for event in events if event["event"] in ("reset", "watchdog")],
         board_dropped_bytes=summary.get("rx_overrun", math.nan),
         **_board_lateness(events, summary, start_ns, end_ns),

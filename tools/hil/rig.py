@@ -24,6 +24,7 @@ from types import TracebackType
 from typing import IO, Any, cast
 
 from modsoft.hil.board.emulator import EmulatedBoard, end
+from modsoft.hil.board.serial_board import SerialBoard
 from modsoft.hil.plant import load_robot
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.report_folder import LOG_PREFIX
@@ -109,14 +110,20 @@ class Rig:
     """Context manager: the board is at `board.port`, the tracker at `tracker_port`, and the robot hangs at rest in real
     time; `run` starts modsoft-runtime on them."""
 
-    def __init__(self, robot_file: str | Path, folder: Path, board: str = "auto"):
-        """`robot_file`: file or shipped name; `folder`: of the traces and the runtime's output."""
+    def __init__(self, robot_file: str | Path, folder: Path, board: str | SerialBoard = "auto"):
+        """`robot_file`: file or shipped name; `folder`: of the traces and the runtime's output; `board`: an emulated
+        board's name, or a real board after its `check`."""
         self.robot = load_robot(robot_file)
         self._robot_file = str(Path(robot_file).resolve() if Path(robot_file).is_file() else robot_file)
         self.folder = folder
         self.runs: Path | None = None  # where the latest runtime logs
         self._follower: Follower | None = None  # of that log
-        self.board = EmulatedBoard(board, on_event=self._board_event)
+        self.board: EmulatedBoard | SerialBoard
+        if isinstance(board, SerialBoard):
+            self.board = board
+            self.board.on_event = self._board_event
+        else:
+            self.board = EmulatedBoard(board, on_event=self._board_event)
         self.plant: Child
         self.tracker: Child
         self.runtime: subprocess.Popen[bytes]
@@ -249,7 +256,7 @@ class Rig:
 
     def _board_event(self, event: Line) -> None:
         _write(self._board_log, event)
-        if event["event"] == "pwm":
+        if event["event"] in ("pwm", "status"):
             self._changed.set()
 
     def _forward_duties(self) -> None:
@@ -261,12 +268,16 @@ class Rig:
 
     def _plant_state(self, state: Line) -> None:
         self.tracker.send({"poses": state.pop("poses")})
-        with contextlib.suppress(DeviceAbsent):  # it starts after the plant and ends before it
-            for channel, pressure_bar in state["channel_bar"].items():
-                if self.board.ready and int(channel) < SENSED_CHANNELS:
-                    self.board.send(f"adc {channel} {self.board.millivolt(pressure_bar)}")
+        if isinstance(self.board, EmulatedBoard):
+            self._set_sensors(self.board, state["channel_bar"])
         self.plant_states.append(state)
         _write(self._plant_log, state)
+
+    def _set_sensors(self, board: EmulatedBoard, channel_bar: dict[str, float]) -> None:
+        with contextlib.suppress(DeviceAbsent):  # it starts after the plant and ends before it
+            for channel, pressure_bar in channel_bar.items():
+                if board.ready and int(channel) < SENSED_CHANNELS:
+                    board.send(f"adc {channel} {board.millivolt(pressure_bar)}")
 
 
 def _stop_runtime(process: subprocess.Popen[bytes]) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from modsoft.hil import post_fault_checks, record
+from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.hil.faults import DETECTED_WITHIN_S, FAULTS, Fault, RunInProgress
 from modsoft.hil.post_fault_checks import InjectedFault, SoakRun
 from modsoft.hil.rig import Rig
@@ -33,6 +34,8 @@ MEMORY_EVERY_S = 5.0
 
 class SoakRig(Rig):
     """The rig with faulty sensors: `sensed`, pressures (bar) that they show, by channel."""
+
+    board: EmulatedBoard
 
     def __init__(self, *args: Any, **options: Any):
         super().__init__(*args, **options)

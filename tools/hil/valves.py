@@ -40,7 +40,8 @@ def spans(record: Record) -> Iterator[Span]:
     before = np.zeros(channels)
     for k, commanded in enumerate(set_points_bar):
         slew_s = float(np.max(np.abs(commanded - before))) / record.slew_bar_per_s
-        settling_s = delays_ms[k] * 1e-3 + slew_s + SETTLING_S + np.nan_to_num(record.board_late_ms) * 1e-3
+        late_ms = np.nan_to_num(record.board_late_ms) + record.outputs_age_ms
+        settling_s = (delays_ms[k] + late_ms) * 1e-3 + slew_s + SETTLING_S
         settled_ns = begins_ns[k] + round(settling_s * 1e9)
         yield Span(before * scale, commanded * scale, begins_ns[k], settled_ns, begins_ns[k + 1])
         before = commanded
@@ -87,4 +88,5 @@ def vent_limit_ms(record: Record) -> float:
     """Time of a vent from the largest pressure at the board's slew, after the longest acknowledgement, ms."""
     assert record.robot.valve is not None
     ramp_s = record.robot.valve.p_max_bar / record.slew_bar_per_s
-    return ACKNOWLEDGED_P99_MS + (ramp_s + SETTLING_S) * 1e3 + float(np.nan_to_num(record.board_late_ms))
+    late_ms = float(np.nan_to_num(record.board_late_ms)) + record.outputs_age_ms
+    return ACKNOWLEDGED_P99_MS + (ramp_s + SETTLING_S) * 1e3 + late_ms
