@@ -36,3 +36,7 @@ def test_other_words_are_kept(text):
 
 def test_every_refused_word_has_terms_to_use():
     assert all(terms.strip() for terms in words.refused().values())
+
+
+def test_sources_and_documents_have_no_refused_word(capsys):
+    assert words.main() == 0, capsys.readouterr().out

@@ -13,4 +13,5 @@ find firmware tests tools training \( -name '*.[ch]' -o -name '*.ino' \) -exec \
     "$bin/python" -c 'import clang_format; clang_format.clang_format()' --dry-run -Werror {} +
 "$bin/python" tools/gen_protocol.py --check
 "$bin/python" tools/wiring.py --check
+"$bin/python" tools/words.py
 "$bin/mypy" -p modsoft.runtime -p modsoft.export -p modsoft.hil -p modsoft.training -p modsoft.study

@@ -1,6 +1,6 @@
 """Refuses words of tools/words.txt in the source and documents of the project: `file:line: word: use ...`, exit code 1.
 
-Identifiers are split into their words: `told_ms` and `ToldMs` both count as "told ms". A line that has to read names of
+Identifiers are split into their words: `old_name` and `OldName` both count as "old name". A line that has to read names of
 earlier versions ends with the comment `words: old names` and is not checked.
 """
 
@@ -15,6 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 LIST = ROOT / "tools/words.txt"
 SUFFIXES = (".py", ".c", ".h", ".ino", ".md", ".toml", ".sh", ".yml", ".cff", ".txt", "Makefile")
+RECORDED = ("docs/reliability.md", "docs/soak.md")  # messages of the programs, as they were when recorded
 OLD_NAMES = "words: old names"
 WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 
@@ -41,7 +42,7 @@ def main() -> int:
     names = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\n")
     for name in names:
         path = ROOT / name
-        if name.endswith(SUFFIXES) and path != LIST and path.is_file():
+        if name.endswith(SUFFIXES) and path != LIST and name not in RECORDED and path.is_file():
             for number, word in sorted(findings(path.read_text(encoding="utf-8"), words)):
                 print(f"{name}:{number}: {word}: use {words[word]}")
                 count += 1

@@ -21,7 +21,7 @@ def run(*arguments, cwd=None):
 
 
 def refused(code, *arguments, cwd=None):
-    """The one line that the command ends with; nobody is there to press Enter."""
+    """The one line that the command ends with; no user is there to press Enter."""
     done = run("--yes", *arguments, cwd=cwd)
     assert done.returncode == code, done.stderr
     assert done.stdout == ""
@@ -32,7 +32,7 @@ def refused(code, *arguments, cwd=None):
 
 @pytest.fixture
 def port(tmp_path):
-    """A file stands in for a port that exists; nothing may open it before everything else is right."""
+    """A file in place of an existing port; no command opens it before all other input is checked."""
     path = tmp_path / "ttyACM0"
     path.touch()
     return path
@@ -154,7 +154,7 @@ def test_one_thing_at_a_time():
 
 
 @pytest.mark.parametrize("redirected", ["</dev/null", "<&-"])
-def test_nobody_there_to_press_enter_is_said_at_once(tmp_path, redirected):
+def test_missing_user_is_reported_at_once(tmp_path, redirected):
     command = ["sh", "-c", f'"$0" --port nowhere {redirected}', SCRIPT]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=60)
     assert done.returncode == 2
@@ -182,17 +182,17 @@ def test_a_simulated_robot_is_refused(port):
     assert "only simulated" in refused(64, "--port", port, "--robot", "cable-4")
 
 
-def test_no_port_told():
+def test_missing_port_is_refused():
     assert "--port" in refused(2, "--robot", "pneumatic-3")
 
 
-def test_the_port_does_not_exist(tmp_path, model_file):
+def test_port_that_does_not_exist(tmp_path, model_file):
     line = refused(69, "--robot", "pneumatic-3", "--model", model_file, "--port", tmp_path / "ttyACM7")
     assert "no board at" in line
     assert "ttyACM7" in line
 
 
-def test_no_model_here(tmp_path, port):
+def test_missing_model_is_refused(tmp_path, port):
     line = refused(65, "--robot", "pneumatic-3", "--port", port, cwd=tmp_path)
     assert "model.onnx" in line
     assert "--model" in line
@@ -213,45 +213,45 @@ def test_no_task(tmp_path, port, model_file):
     assert "edge, down" in refused(2, "--port", port, "--model", model_file, "--task", "up", cwd=tmp_path)
 
 
-def test_no_tracker_told(port, model_file):
+def test_missing_tracker_port_is_refused(port, model_file):
     assert "--tracker-port" in refused(2, "--robot", "pneumatic-3", "--port", port, "--model", model_file)
 
 
-def test_the_tracker_does_not_exist(tmp_path, port, model_file, tools):
-    told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, *tools]
-    line = refused(69, *told, "--tracker-port", tmp_path / "ttyUSB7")
+def test_tracker_that_does_not_exist(tmp_path, port, model_file, tools):
+    options = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, *tools]
+    line = refused(69, *options, "--tracker-port", tmp_path / "ttyUSB7")
     assert "no tracker at" in line
-    line = refused(69, *told, "--tracker-port", "/dev/null")
+    line = refused(69, *options, "--tracker-port", "/dev/null")
     assert "no polaris tracker answers" in line
     assert port.read_bytes() == b""
 
 
 def test_recorded_frames_drive_no_valve(tmp_path, port, model_file):
-    told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file]
-    line = refused(2, *told, "--tracker", "replay", "--tracker-port", tmp_path)
+    options = ["--robot", "pneumatic-3", "--port", port, "--model", model_file]
+    line = refused(2, *options, "--tracker", "replay", "--tracker-port", tmp_path)
     assert "--dry-run" in line
 
 
-def test_no_tools_told(port, model_file):
-    told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
-    line = refused(2, *told)
+def test_missing_tools_are_refused(port, model_file):
+    options = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
+    line = refused(2, *options)
     assert "0 tool definition files" in line
     assert "--tool" in line
-    assert ": 1 tool definition file, " in refused(2, *told, "--tool", "base.rom")
+    assert ": 1 tool definition file, " in refused(2, *options, "--tool", "base.rom")
 
 
 def test_a_folder_for_a_tool(tmp_path, port, model_file, tools):
-    told = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
-    assert "is a folder" in refused(2, *told, *tools[:-1], tmp_path)
+    options = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
+    assert "is a folder" in refused(2, *options, *tools[:-1], tmp_path)
 
 
-def test_tools_of_a_robot_file_lie_beside_it(tmp_path, port, model_file):
+def test_tools_are_relative_to_the_robot_file(tmp_path, port, model_file):
     (tmp_path / "arm").mkdir()
     names = '["base.rom", "1.rom", "2.rom", "3.rom"]'
     text = robot_file.text_of("pneumatic-3").replace("tools = []", f"tools = {names}")
     (tmp_path / "arm" / "robot.toml").write_text(text)
-    told = ["--robot", "arm/robot.toml", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
-    assert os.path.join("arm", "base.rom") in refused(69, *told, cwd=tmp_path)
+    options = ["--robot", "arm/robot.toml", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
+    assert os.path.join("arm", "base.rom") in refused(69, *options, cwd=tmp_path)
 
 
 @pytest.mark.parametrize("wrong", [["--steps", "0"], ["--tracker", "sonar"], ["--prot", "x"]])
@@ -265,6 +265,6 @@ def test_usage(wrong):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_the_exit_code_survives_a_standard_error_that_cannot_be_written():
     with open("/dev/full", "w") as full:
-        told = ["--yes", "--robot", "cable-4"]
-        done = subprocess.run([SCRIPT, *told], stderr=full, stdin=subprocess.DEVNULL, timeout=60)
+        options = ["--yes", "--robot", "cable-4"]
+        done = subprocess.run([SCRIPT, *options], stderr=full, stdin=subprocess.DEVNULL, timeout=60)
     assert done.returncode == 64

@@ -173,7 +173,7 @@ def test_a_board_in_trouble_ends_the_run_between_two_ticks(error):
 
 
 @pytest.mark.parametrize("error", [StopKey("stop key pressed"), Interrupted(2)])
-def test_whoever_wants_to_stop_is_obeyed_between_two_ticks(error):
+def test_stop_request_is_obeyed_between_two_ticks(error):
     world = World(steps=20)
     world.at[5] = lambda: world.stop.request(error)
     with pytest.raises(type(error)):
@@ -181,7 +181,7 @@ def test_whoever_wants_to_stop_is_obeyed_between_two_ticks(error):
     assert world.time_s == pytest.approx(world.due_s(5))
 
 
-def test_whoever_wanted_to_stop_during_arming_sees_no_valve_open():
+def test_stop_request_during_arming_keeps_every_valve_closed():
     world = World(steps=20)
     world.stop.request(Interrupted(2))
     with pytest.raises(Interrupted):
@@ -304,9 +304,9 @@ def test_acknowledgements_belong_to_the_step_before():
     world.at[2] = lambda: setattr(world, "acknowledging", False)
     world.at[4] = lambda: setattr(world, "acknowledging", True)
     world.run()
-    told = [record.acknowledged for record in world.records if hasattr(record, "acknowledged")]
-    assert [entry.tick for entry in told] == [-1, 0, 1, 2, 3, 4, 5]
-    assert [entry.ms for entry in told][1:] == pytest.approx(world.tick_statistics.acknowledged_ms)
+    acknowledged = [record.acknowledged for record in world.records if hasattr(record, "acknowledged")]
+    assert [entry.tick for entry in acknowledged] == [-1, 0, 1, 2, 3, 4, 5]
+    assert [entry.ms for entry in acknowledged][1:] == pytest.approx(world.tick_statistics.acknowledged_ms)
     assert sum(ms is None for ms in world.tick_statistics.acknowledged_ms) == 2
 
 
@@ -359,7 +359,7 @@ def test_a_rehearsal_runs_the_task_without_a_board():
     assert world.ticks[0].board is None
 
 
-# ---- what is told of it
+# ---- Summary and status line
 
 
 def test_summary_and_figures():
@@ -380,9 +380,9 @@ def test_summary_and_figures():
 
 
 def test_summary_of_a_run_that_never_began():
-    tally = TickStatistics(ROBOT, 10)
-    assert tally.figures()["late_ms"] is None
-    assert tally.summary()[0] == "0 of 10 control steps"
+    statistics = TickStatistics(ROBOT, 10)
+    assert statistics.figures()["late_ms"] is None
+    assert statistics.summary()[0] == "0 of 10 control steps"
 
 
 def test_status_line():

@@ -1,4 +1,4 @@
-"""How a run ends: venting first, the log closed, and what is said and raised."""
+"""How a run ends: it vents first, closes the log, prints a summary and raises the cause."""
 
 import json
 
@@ -18,19 +18,19 @@ ROBOT = robot_file.load("pneumatic-3")
 
 
 class Board:
-    """Answers a request to vent with `word`, or raises it."""
+    """Answers a request to vent with `answer`, or raises it."""
 
-    def __init__(self, word, pressed=()):
-        self.status, self.modes, self.statistics, self.pressed = word, [], {"sets": 3}, dict(pressed)
+    def __init__(self, answer, pressed=()):
+        self.answer, self.modes, self.statistics, self.pressed = answer, [], {"sets": 3}, dict(pressed)
 
     def residual_pressures_bar(self):
         return self.pressed
 
     def vent(self, mode):
         self.modes.append(mode)
-        if isinstance(self.status, Exception):
-            raise self.status
-        return self.status
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
 
 
 class Ending:
@@ -43,7 +43,7 @@ class Ending:
             shutdown.finish(board, log, TickStatistics(ROBOT, 10), LatestFrame(), error)
         except BaseException as raised:  # noqa: BLE001 - looked at by the test
             self.raised = raised
-        self.said = capsys.readouterr().err
+        self.output = capsys.readouterr().err
         self.meta = json.loads((log.folder / "meta.json").read_text())
         self.end = json.loads((log.folder / "run.jsonl").read_text().splitlines()[-1])
 
@@ -53,17 +53,17 @@ def test_done(tmp_path, capsys):
     ending = Ending(tmp_path, capsys, board)
     assert ending.raised is None
     assert board.modes == [VentMode.RAMP]
-    assert "valves vented: yes, confirmed by the board" in ending.said
+    assert "valves vented: yes, confirmed by the board" in ending.output
     assert (ending.meta["exit_code"], ending.meta["reason"], ending.meta["vented"]) == (0, "done", True)
     assert (ending.end["event"], ending.end["exit_code"], ending.end["vented"]) == ("end", 0, True)
 
 
-@pytest.mark.parametrize("word", [False, OSError("port gone")])
-def test_a_board_that_does_not_say_so_is_not_vented(tmp_path, capsys, word):
-    ending = Ending(tmp_path, capsys, Board(word))
+@pytest.mark.parametrize("answer", [False, OSError("port gone")])
+def test_unconfirmed_venting_is_not_reported_as_vented(tmp_path, capsys, answer):
+    ending = Ending(tmp_path, capsys, Board(answer))
     assert isinstance(ending.raised, LostInRun | OSError)
-    assert "yes, confirmed" not in ending.said
-    assert "NOT KNOWN" in ending.said
+    assert "yes, confirmed" not in ending.output
+    assert "NOT KNOWN" in ending.output
     assert ending.meta["exit_code"] in (74, 70)
     assert ending.meta["vented"] is False
 
@@ -81,26 +81,26 @@ def test_a_board_that_does_not_say_so_is_not_vented(tmp_path, capsys, word):
         (KeyboardInterrupt(), 70),
     ],
 )
-@pytest.mark.parametrize("word", [True, False])
-def test_what_ended_the_run_is_raised_after_the_venting(tmp_path, capsys, error, code, word):
-    board = Board(word)
+@pytest.mark.parametrize("answer", [True, False])
+def test_what_ended_the_run_is_raised_after_the_venting(tmp_path, capsys, error, code, answer):
+    board = Board(answer)
     ending = Ending(tmp_path, capsys, board, error)
     assert ending.raised is error
     assert board.modes == [VentMode.RAMP]
     assert ending.meta["exit_code"] == code
     assert ending.meta["reason"]
-    assert ("yes, confirmed" in ending.said) == word
+    assert ("yes, confirmed" in ending.output) == answer
 
 
 @pytest.mark.parametrize("error", [None, Interrupted(2), LostInRun("tracker lost")])
-def test_pressure_that_stays_after_the_venting_is_said_and_trips(tmp_path, capsys, error):
+def test_pressure_that_stays_after_the_venting_is_reported_and_trips(tmp_path, capsys, error):
     ending = Ending(tmp_path, capsys, Board(True, {2: 0.213}), error)
     assert isinstance(ending.raised, Tripped)
-    said = str(ending.raised)
-    assert "the valves are commanded to 0, but channel 2 still measures 0.21 bar" in said
-    assert "\n" not in said
-    assert ("tracker lost" in said) == isinstance(error, LostInRun)
-    assert (ending.meta["exit_code"], ending.meta["reason"]) == (79, said)
+    message = str(ending.raised)
+    assert "the valves are commanded to 0, but channel 2 still measures 0.21 bar" in message
+    assert "\n" not in message
+    assert ("tracker lost" in message) == isinstance(error, LostInRun)
+    assert (ending.meta["exit_code"], ending.meta["reason"]) == (79, message)
     assert (ending.end["exit_code"], ending.end["vented"], ending.end["residual_bar"]) == (79, True, {"2": 0.213})
 
 
@@ -110,18 +110,18 @@ def test_the_stop_key_vents_at_once(tmp_path, capsys):
     assert board.modes == [VentMode.DUMP]
 
 
-def test_the_venting_is_told_although_the_disk_hangs(tmp_path, capsys, monkeypatch):
-    said = []
-    monkeypatch.setattr(RunLog, "close", lambda *told: said.append(capsys.readouterr().err))
+def test_venting_is_reported_although_the_disk_hangs(tmp_path, capsys, monkeypatch):
+    outputs = []
+    monkeypatch.setattr(RunLog, "close", lambda *arguments: outputs.append(capsys.readouterr().err))
     log = RunLog(tmp_path, "arm", "", {})
     shutdown.finish(Board(True), log, TickStatistics(ROBOT, 10), LatestFrame(), None)
-    assert "valves vented: yes, confirmed by the board" in said[0]
+    assert "valves vented: yes, confirmed by the board" in outputs[0]
 
 
-def test_a_dry_run_says_so(tmp_path, capsys):
+def test_dry_run_is_reported(tmp_path, capsys):
     ending = Ending(tmp_path, capsys, None)
-    assert "no valve was used" in ending.said
-    assert "yes" not in ending.said
+    assert "no valve was used" in ending.output
+    assert "yes" not in ending.output
     assert ending.meta["vented"] is False
 
 
