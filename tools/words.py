@@ -1,7 +1,7 @@
 """Refuses words of tools/words.txt in the source and documents of the project: `file:line: word: use ...`, exit code 1.
 
-Identifiers are split into their words: `old_name` and `OldName` both count as "old name". A line that has to read names of
-earlier versions ends with the comment `words: old names` and is not checked.
+Identifiers are split into their words: `old_name` and `OldName` both count as "old name". A line that has to read names
+of earlier versions ends with the comment `words: old names` and is not checked.
 """
 
 from __future__ import annotations
