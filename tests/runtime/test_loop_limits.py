@@ -71,17 +71,20 @@ def test_tracker_without_any_frame_ends_the_run_at_the_third_step():
     assert world.time_s == pytest.approx(world.due_s(2))
 
 
+@pytest.mark.parametrize("problem", ["", "no reply"])
 @pytest.mark.parametrize(("beyond_s", "lost"), [(-0.001, False), (0.0, False), (0.001, True)])
-def test_silence_of_the_tracker_is_noticed_half_a_slice_early(beyond_s, lost):
+def test_silence_of_the_tracker_is_noticed_half_a_slice_early(beyond_s, lost, problem):
     world = World()
     frames = LatestFrame()
     frames.put(dataclasses.replace(world.frame(), monotonic_s=0.0))
+    frames.problem = problem
     loop = dataclasses.replace(world.loop, frames=frames)
     world.time_s = 3 * PERIOD_S - 0.05 / 2 + beyond_s
     if not lost:
         loop._idle()
         return
-    with pytest.raises(LostInRun, match=r"no new frame for 1\.2 s"):
+    cause = r" \(no reply\)" if problem else ""
+    with pytest.raises(LostInRun, match=rf"no new frame for 1\.2 s{cause}; look"):
         loop._idle()
 
 

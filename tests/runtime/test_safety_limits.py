@@ -69,6 +69,13 @@ def test_promptest_frame_is_forgotten_after_a_minute(delayed_until_s, status):
     assert validator.check(probe, at_s + 0.5).status == status
 
 
+def test_delay_is_compared_with_four_frames_a_second():
+    validator = settled(device_hz=64.0)
+    for number in range(1, 129):
+        assert validator.check(tracker_frame(number, number / 64, device_hz=64.0), number / 64).good
+    assert list(validator._prompt) == [(number / 64, number) for number in range(0, 129, 16)]
+
+
 # ---- content
 
 
