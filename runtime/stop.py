@@ -107,7 +107,7 @@ class Keys(TerminalThread):
 
     def _target(self) -> Callable[[], None] | None:
         termios, tty, msvcrt = map(system_module, ("termios", "tty", "msvcrt"))
-        read = self._posix(termios, tty) if termios and tty else self._windows(msvcrt) if msvcrt else None
+        read = self._posix(termios, tty) if termios else self._windows(msvcrt) if msvcrt else None
         return None if read is None else lambda: self._run(read)
 
     def __exit__(
@@ -132,7 +132,7 @@ class Keys(TerminalThread):
             return None
         try:
             terminal = sys.stdin.fileno()
-            if not os.isatty(terminal) or os.tcgetpgrp(terminal) != os.getpgrp():
+            if os.tcgetpgrp(terminal) != os.getpgrp():  # raises OSError if it is no terminal of this process
                 return None  # the system stops a background job that uses its terminal
             before = termios.tcgetattr(terminal)
             tty.setcbreak(terminal)  # Ctrl-C stays a signal

@@ -1,15 +1,13 @@
 """Signals and stop keys become one request; a second Ctrl-C leaves at once."""
 
 import io
-import os
 import signal
 import threading
-from types import SimpleNamespace
 
 import pytest
 
 from modsoft.runtime.errors import Tripped
-from modsoft.runtime.stop import SIGNALS, Interrupted, Keys, Signals, Stop, StopKey
+from modsoft.runtime.stop import SIGNALS, Interrupted, Signals, Stop, StopKey
 from modsoft.runtime.terminal import StatusLine
 
 CODES = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129}
@@ -60,56 +58,19 @@ def test_in_the_run_a_signal_only_asks(number):
         assert left == ([NUMBERS[number]] if number in (signal.SIGINT, signal.SIGTERM) else [])
 
 
-def test_keys_do_nothing_without_a_terminal(monkeypatch):
-    monkeypatch.setattr("sys.stdin", io.StringIO("q"))
-    stop = Stop()
-    with Keys(stop):
-        stop.wait(0)
-    assert stop.error is None
+def test_signal_is_named():
+    assert str(Interrupted(signal.SIGINT)) == "stopped by SIGINT"
 
 
-def test_keys_and_status_line_do_without_closed_streams(monkeypatch):
-    monkeypatch.setattr("sys.stdin", None)
-    stop = Stop()
-    with Keys(stop), StatusLine(lambda: "one", None):
-        stop.wait(0)
-    assert stop.error is None
-
-
-@pytest.fixture
-def terminal(monkeypatch):
-    """A pseudo-terminal as standard input, ours to read from."""
-    pytest.importorskip("termios", reason="no pseudo-terminals on this system")
-    master, slave = os.openpty()
-    with open(slave, closefd=False) as stream:
-        monkeypatch.setattr("sys.stdin", stream)
-        monkeypatch.setattr("os.tcgetpgrp", lambda file: os.getpgrp())
-        yield master, slave
-    os.close(master)
-    os.close(slave)
-
-
-@pytest.mark.parametrize("key", [b" ", b"q", b"\x1b", b"xyq"])
-def test_stop_keys(terminal, key):
-    import termios
-
-    master, slave = terminal
-    before = termios.tcgetattr(slave)
-    stop = Stop()
-    with Keys(stop):
-        os.write(master, key)
-        stop.wait(10)
-        assert isinstance(stop.error, StopKey)
-    assert termios.tcgetattr(slave) == before
-
-
-def test_other_keys_are_no_stop(terminal):
-    master, _ = terminal
-    stop = Stop()
-    with Keys(stop):
-        os.write(master, b"xyz\n")
-        stop.wait(0.2)
-    assert stop.error is None
+@pytest.mark.parametrize("number", NUMBERS)
+def test_second_signal_before_the_run_does_not_raise_again(number):
+    """The program is already on its way out: only Ctrl-C and SIGTERM hurry it."""
+    left = []
+    with Signals(Stop(), left.append):
+        with pytest.raises(Interrupted):
+            signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(number)
+    assert left == ([NUMBERS[number]] if number in (signal.SIGINT, signal.SIGTERM) else [])
 
 
 class Terminal(io.StringIO):
@@ -117,42 +78,9 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.fixture
-def console(monkeypatch):
-    """Windows: no termios, and a console of which msvcrt gives the keys in the list."""
-    keys = []
-    msvcrt = SimpleNamespace(kbhit=lambda: bool(keys), getwch=lambda: keys.pop(0))
-    monkeypatch.setattr("modsoft.runtime.stop.system_module", {"msvcrt": msvcrt}.get)
-    monkeypatch.setattr("sys.stdin", Terminal())
-    return keys
-
-
-@pytest.mark.parametrize("keys", [" ", "q", "\x1b", "xyq", "\xe0Hq"])
-def test_stop_keys_of_a_windows_console(console, keys):
-    console += keys
-    stop = Stop()
-    with Keys(stop):
-        stop.wait(10)
-    assert isinstance(stop.error, StopKey)
-
-
-def test_keys_of_windows_do_nothing_without_a_console(console, monkeypatch):
-    monkeypatch.setattr("sys.stdin", io.StringIO("q"))
-    console += "q"
-    stop = Stop()
-    with Keys(stop):
+def test_closed_stream_has_no_status_line():
+    with StatusLine(lambda: "one", None):
         pass
-    assert stop.error is None
-    assert console == ["q"]
-
-
-def test_keys_do_nothing_where_a_system_has_no_way_to_read_them(monkeypatch):
-    monkeypatch.setattr("modsoft.runtime.stop.system_module", {}.get)
-    monkeypatch.setattr("sys.stdin", Terminal())
-    stop = Stop()
-    with Keys(stop):
-        pass
-    assert stop.error is None
 
 
 def test_status_line_is_written_over(monkeypatch):
