@@ -1,13 +1,13 @@
-# What a newcomer types: make demo, make install, make test. What a developer types: make check.
+# For users: make demo, make install, make test. For developers: make check.
 
 # torch with two threads on two busy cores can be ten times slower than with one.
 export OMP_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
-# The test matrices need no display.
+# Plots need no display.
 export MPLBACKEND ?= Agg
 
 PYTEST := .venv/bin/python -m pytest
-# It holds the checkout's path: in one that was copied or moved, .venv refers to the original.
+# Holds the path of the checkout. In a copied or moved checkout .venv still refers to the original.
 INSTALLED := .venv/.installed
 MOVED := $(shell [ ! -e $(INSTALLED) ] || [ "$$(cat $(INSTALLED))" = "$$(pwd -P)" ] || echo moved)
 
@@ -33,35 +33,35 @@ test-python: $(INSTALLED)
 dist: $(INSTALLED)
 	.venv/bin/python tools/dist.py
 
-# Collection through a real one-node SLURM, which the test installs and starts: root on Debian.
+# Collection through a real one-node SLURM, which the test installs and starts. Needs root on Debian.
 test-cluster: $(INSTALLED)
 	$(PYTEST) -m cluster
 
-# The failure matrix, a test a row, to docs/reliability.md.
+# Runs the failure matrix, one test per row, and writes docs/reliability.md.
 reliability: $(INSTALLED)
 	.venv/bin/python tools/reliability.py
 
-# An hour of the rig with a fault about once a minute, then the long proofs.
+# An hour of the rig with a fault about once a minute, then the failure matrix with its full numbers.
 soak: $(INSTALLED)
 	.venv/bin/python tools/soak.py --report docs/soak.md --proofs
 
 check: $(INSTALLED)
 	tools/check.sh
 
-# The safety part: the firmware by its native tests, and the files of the runtime that pyproject.toml lists by their unit
-# tests. Fails below 100 % of lines and branches.
+# Coverage of the safety part: of the firmware by its native tests, of the runtime's files in pyproject.toml by their
+# unit tests. Fails below 100 % of lines and branches.
 SAFETY_PARTS := connection controller loop safety stop
 coverage: $(INSTALLED)
 	.venv/bin/python tools/coverage.py
 	.venv/bin/python -m coverage run -m pytest -q $(foreach part,$(SAFETY_PARTS),$(wildcard tests/runtime/test_$(part)*.py))
 	.venv/bin/python -m coverage report
 
-# Small wrong changes of the same files, each of which their tests must detect.
+# Mutation testing of the same files: their tests must detect every small wrong change.
 mutation: $(INSTALLED)
 	.venv/bin/python tools/mutate.py
 	.venv/bin/python tools/mutate_runtime.py
 
-# Coverage-guided fuzzing of the firmware for FUZZ_SECONDS; needs clang, which it installs or asks for.
+# Coverage-guided fuzzing of the firmware for FUZZ_SECONDS. Needs clang: installs it as root, else prints the command.
 FUZZ_SECONDS ?= 60
 fuzz:
 	tools/fuzz/run.sh $(FUZZ_SECONDS)

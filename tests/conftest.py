@@ -35,7 +35,7 @@ def _host_load():
 
 @pytest.fixture(autouse=True)
 def _measured_host(request):
-    """Tests against the wall clock run beside the host-load check; `pytest_runtest_makereport` reads its result."""
+    """Runs the host-load check during tests against the wall clock; `pytest_runtest_makereport` reads its result."""
     if request.node.get_closest_marker("realtime"):
         request.node.host_load = request.getfixturevalue("_host_load")
         request.node.host_load.worst_s()
@@ -50,7 +50,7 @@ def pytest_runtest_makereport(item, call):
 
 @pytest.fixture(autouse=True)
 def child_imports():
-    """Restores how child processes import, which a command that a test runs in this process changes."""
+    """Restores PYTHONSAFEPATH, which a command sets for its child processes, after a test that runs it in-process."""
     before = os.environ.get("PYTHONSAFEPATH")
     yield
     if before is None:
@@ -71,19 +71,19 @@ def make_checkpoint():
         from modsoft.training import checkpoint as checkpoints
         from modsoft.training import networks
 
-        found = robot_file.load(robot)
-        names = feature_names(found.kind, history)
-        sizes = {"name": name, "feature_size": len(names), "action_size": found.action_size, "layers": layers}
+        description = robot_file.load(robot)
+        names = feature_names(description.kind, history)
+        sizes = {"name": name, "feature_size": len(names), "action_size": description.action_size, "layers": layers}
         sizes |= {"hidden": hidden, "dropout": 0.1, "history": history}
         if name != "bilstm":
-            sizes["modules"] = found.modules
+            sizes["modules"] = description.modules
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             network = networks.build(sizes)
         checkpoints.save(
             {
                 "schema": checkpoints.SCHEMA,
-                "robot": found.to_dict(),
+                "robot": description.to_dict(),
                 "network": sizes,
                 "features": names,
                 "weights": {name: gain * tensor for name, tensor in network.state_dict().items()},
@@ -98,8 +98,8 @@ def make_checkpoint():
 
 @pytest.fixture(scope="session")
 def exported(tmp_path_factory, make_checkpoint):
-    """exported(name, **settings) returns the model of make_checkpoint(**settings). With MODSOFT_TEST_MODELS, models are
-    kept in that folder: a Python without torch uses those of another Python."""
+    """exported(name, **settings) returns the model of make_checkpoint(**settings). MODSOFT_TEST_MODELS names a folder
+    that keeps the models: a Python without torch uses those of another Python."""
     folder = os.environ.get("MODSOFT_TEST_MODELS")
 
     def export_once(name, **settings):

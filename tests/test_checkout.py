@@ -1,4 +1,4 @@
-"""A checkout that was copied or moved with its .venv: make notices it, and the tests never test the original."""
+"""A checkout that was copied or moved with its .venv: make installs it again, and its tests refuse the original."""
 
 import os
 import shutil
@@ -18,7 +18,7 @@ def run(*command, **options):
 
 
 @posix
-def test_make_installs_again_where_the_environment_is_of_another_checkout(tmp_path):
+def test_make_installs_a_copied_checkout_again(tmp_path):
     first, second = tmp_path / "first", tmp_path / NAME
     sources = ("training/simulation/fleet.c", "training/simulation/fleet_kernel.h")
     prerequisites = ("pyproject.toml", "setup.py", "constraints.txt", *sources)
@@ -37,7 +37,7 @@ def test_make_installs_again_where_the_environment_is_of_another_checkout(tmp_pa
 
 
 @posix
-def test_a_moved_environment_refers_to_its_new_place(tmp_path):
+def test_moved_environment_has_the_new_path(tmp_path):
     first, second = tmp_path / "first", tmp_path / NAME
     first.mkdir()
     run(sys.executable, "-m", "venv", "--without-pip", first / ".venv")
@@ -60,7 +60,7 @@ def test_a_moved_environment_refers_to_its_new_place(tmp_path):
     assert str(first) not in (environment / "bin" / "activate").read_text()
 
 
-def test_tests_of_another_checkout_than_the_installed_one_do_not_run(tmp_path):
+def test_tests_refuse_an_installation_of_another_checkout(tmp_path):
     shutil.copytree(ROOT / "tests" / "shared", tmp_path / "tests" / "shared")
     for name in ("pyproject.toml", "tests/conftest.py"):
         shutil.copy(ROOT / name, tmp_path / name)

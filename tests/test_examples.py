@@ -1,4 +1,4 @@
-"""The examples run as they are, and stay short enough to read at once."""
+"""The examples run without changes and have at most forty lines."""
 
 import subprocess
 import sys

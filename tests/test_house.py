@@ -1,4 +1,4 @@
-"""What a reviewer would check by hand every time: style, the generated protocol, and who imports whom."""
+"""Rules for the whole source tree: style, generated files, and the direction of imports."""
 
 import ast
 import subprocess
@@ -58,7 +58,7 @@ def test_c_files_and_functions_are_short_or_give_a_reason():
     for path in C_SOURCES:
         lines = path.read_text().splitlines()
         assert len(lines) <= 300 or "More than 300 lines" in "\n".join(lines[:30]), path
-        started = 0  # the style puts the first line of a function, and its last brace, at the left edge
+        started = 0  # the style starts a function and its last brace in the first column
         for number, line in enumerate(lines):
             if line[:1].isalpha():
                 started = number

@@ -1,4 +1,4 @@
-"""The models that ship in tools/models: whole, of the robots that they are for, and able to drive them."""
+"""The models in tools/models: their description, and their control of the simulated robots."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ needs_fleet = pytest.mark.skipif(not fleet_kernel.variants(), reason="the fleet'
     ("file", "robot"),
     [("pneumatic-3", "pneumatic-3"), ("pneumatic-3", "pneumatic-2"), ("cable-4", "cable-4"), ("cable-4", "cable-6")],
 )
-def test_a_shipped_model_is_of_its_robots_and_says_how_it_was_made(file, robot):
+def test_shipped_model_fits_its_robots_and_has_its_provenance(file, robot):
     controller = Model.load(MODELS / f"{file}.onnx")
     controller.check(robot_file.load(robot))
     provenance = controller.description.provenance
@@ -32,18 +32,18 @@ def test_a_shipped_model_is_of_its_robots_and_says_how_it_was_made(file, robot):
 
 @needs_fleet
 @pytest.mark.parametrize(
-    ("file", "robot", "task", "most"),
+    ("file", "robot", "task", "limit"),
     [("pneumatic-3", "pneumatic-3", "down", 1.0), ("cable-4", "cable-4", "A", 2.0), ("cable-4", "cable-6", "A", 8.0)],
 )
-def test_a_shipped_model_drives_its_robot(file, robot, task, most):
-    """most: of the mean error of any module, degrees or percent, over the first 60 steps; far more than was measured,
-    far less than that of a model that does not drive."""
+def test_shipped_model_controls_its_robot(file, robot, task, limit):
+    """limit: of the mean error of each module over the first 60 steps, degrees or percent; far above the measured error
+    and below half of that of a robot that does not move."""
     robot = robot_file.load(robot)
     controller = Model.load(MODELS / f"{file}.onnx")
     desired = tasks.task(task, robot.kind, robot.modules)[:60]
     setup = ControllerSetup(robot, controller.actuate, controller.history, desired)
-    (driven,) = rollout.rollout(Fleet(robot.kind, robot.modules, 1), [setup]).robots()
+    (run,) = rollout.rollout(Fleet(robot.kind, robot.modules, 1), [setup]).robots()
     errors = rollout.angle_errors_deg if robot.kind == "pneumatic" else rollout.configuration_errors_percent
-    assert errors(driven.configuration, desired).mean(axis=0).max() < most
-    still = np.broadcast_to(driven.configuration[:1], (61, robot.modules, 3))
-    assert errors(still, desired).mean(axis=0).max() > 2 * most
+    assert errors(run.configuration, desired).mean(axis=0).max() < limit
+    at_rest = np.broadcast_to(run.configuration[:1], (61, robot.modules, 3))
+    assert errors(at_rest, desired).mean(axis=0).max() > 2 * limit

@@ -1,4 +1,4 @@
-"""No command replaces what it reads: every console script that writes a file, and every file that it reads."""
+"""No command replaces its input: every console script that writes a file, and every file that it reads."""
 
 import sys
 
@@ -34,7 +34,7 @@ def lab(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("main", "arguments", "read"),
+    ("main", "arguments", "input_file"),
     [
         (SIMULATE, ["--robot", "robot.toml", "--actions", "a.npy", "--out", "OUT"], "a.npy"),
         (SIMULATE, ["--robot", "robot.toml", "--actions", "a.npy", "--out", "OUT"], "robot.toml"),
@@ -48,10 +48,10 @@ def lab(tmp_path, monkeypatch):
     ],
 )
 @pytest.mark.parametrize("by", ["name", "link"])
-def test_a_command_refuses_to_replace_what_it_reads(lab, monkeypatch, capsys, main, arguments, read, by):
-    out = read
+def test_command_refuses_to_replace_its_input(lab, monkeypatch, capsys, main, arguments, input_file, by):
+    out = input_file
     if by == "link" and "OUT" in arguments:
-        (lab / "link").symlink_to(read)
+        (lab / "link").symlink_to(input_file)
         out = "link"
     before = {path.name: path.read_bytes() for path in lab.iterdir()}
     monkeypatch.setattr(sys, "argv", ["command", *(out if each == "OUT" else each for each in arguments)])
@@ -63,7 +63,7 @@ def test_a_command_refuses_to_replace_what_it_reads(lab, monkeypatch, capsys, ma
     assert {path.name: path.read_bytes() for path in lab.iterdir()} == before
 
 
-def test_a_study_does_not_write_its_report_over_its_notes(tmp_path):
+def test_study_refuses_to_replace_its_notes_by_its_report(tmp_path):
     folder = Folder(tmp_path)
     folder.notes.write_text("mine")
     folder.report.symlink_to(folder.notes)

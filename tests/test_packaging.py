@@ -1,4 +1,4 @@
-"""What a lab PC gets: the wheel with no extra, in an environment of its own."""
+"""The wheel without extras, as a lab PC installs it, and the source distribution."""
 
 import json
 import os
@@ -17,12 +17,12 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
-    """A copy of the checkout: setuptools would leave its build folder there."""
+    """A copy of the checkout, because setuptools writes a build folder into it."""
     folder = tmp_path_factory.mktemp("source") / "modsoft"
-    leave = shutil.ignore_patterns(
+    ignored = shutil.ignore_patterns(
         ".git", ".venv", "build", "demo", "runs", "out", "*.egg-info", "__pycache__", ".*_cache", "*.so", "dist"
     )
-    return shutil.copytree(ROOT, folder, ignore=leave)
+    return shutil.copytree(ROOT, folder, ignore=ignored)
 
 
 def build_wheel(source, folder, **environment):
@@ -39,26 +39,26 @@ def wheel(source, tmp_path_factory):
     return build_wheel(source, tmp_path_factory.mktemp("wheel"))
 
 
-def test_without_a_c_compiler_the_wheel_is_built_without_the_kernel(source, tmp_path):
+def test_wheel_without_a_c_compiler_has_no_kernel(source, tmp_path):
     copy = shutil.copytree(source, tmp_path / "copy", ignore=shutil.ignore_patterns("build", "*.so", "*.egg-info"))
     names = zipfile.ZipFile(build_wheel(copy, tmp_path, CC="false")).namelist()
     assert "modsoft/training/simulation/fleet.py" in names
     assert not [name for name in names if "_fleet" in name]
 
 
-def test_the_source_distribution_holds_all_that_a_build_needs(source, tmp_path):
+def test_source_distribution_has_the_files_of_a_build(source, tmp_path):
     command = [sys.executable, "-m", "build", "--sdist", "--outdir", tmp_path, source]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     sources = ("training/simulation/fleet.c", "training/simulation/fleet_kernel.h", "tools/hil/rig.py")
-    needed = ("LICENSE", "README.md", "setup.py", *sources)
+    required = ("LICENSE", "README.md", "setup.py", *sources)
     robots = [f"runtime/robots/{path.name}" for path in (ROOT / "runtime" / "robots").glob("*.toml")]
     assert len(robots) >= 4
-    assert names.issuperset([*needed, *robots])
+    assert names.issuperset([*required, *robots])
 
 
-def test_wheel_holds_the_five_parts_and_nothing_else(wheel):
+def test_wheel_has_exactly_the_five_parts(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     tops = {"/".join(name.split("/")[:2]) for name in names if not name.split("/")[0].endswith(".dist-info")}
     assert tops == {"modsoft/runtime", "modsoft/training", "modsoft/export", "modsoft/hil", "modsoft/study"}
@@ -70,7 +70,7 @@ def test_wheel_holds_the_five_parts_and_nothing_else(wheel):
 
 @pytest.fixture(scope="module")
 def clean(wheel, tmp_path_factory):
-    """A new environment with the wheel and what it asks for itself."""
+    """A new environment with the wheel and its required packages."""
     folder = tmp_path_factory.mktemp("clean")
     subprocess.run([sys.executable, "-m", "venv", folder / "venv"], check=True)
     pip = [folder / "venv/bin/python", "-m", "pip", "--quiet", "--disable-pip-version-check"]
@@ -78,7 +78,7 @@ def clean(wheel, tmp_path_factory):
     return folder
 
 
-def test_no_extra_gives_a_working_runtime_without_the_heavy_packages(clean):
+def test_runtime_without_extras_works_without_the_heavy_packages(clean):
     python = clean / "venv/bin/python"
     code = (
         "from importlib.util import find_spec\n"
@@ -96,8 +96,8 @@ def test_no_extra_gives_a_working_runtime_without_the_heavy_packages(clean):
     assert "--port" in helped.stdout
 
 
-def hanging_still(path, seconds=6.0, hz=20.0):
-    """A run log in which four tools hang straight under each other, with a little noise as a tracker has it."""
+def write_robot_at_rest(path, seconds=6.0, hz=20.0):
+    """Writes a run log in which a robot of three modules hangs straight, with the noise of a tracker."""
     rng = random.Random(1)
     with path.open("w") as file:
         for k in range(int(seconds * hz)):
@@ -105,16 +105,16 @@ def hanging_still(path, seconds=6.0, hz=20.0):
                 [[1, 0, 0, rng.gauss(0, 0.05)], [0, 1, 0, rng.gauss(0, 0.05)], [0, 0, 1, 50.0 * tool], [0, 0, 0, 1]]
                 for tool in range(4)
             ]
-            seen = {"number": 1 + k, "mono_ns": int(k / hz * 1e9), "poses": pose, "valid": [True] * 4}
-            file.write(json.dumps({"tick": k, "frame": {**seen, "quality": [0.1] * 4}}) + "\n")
+            frame = {"number": 1 + k, "mono_ns": int(k / hz * 1e9), "poses": pose, "valid": [True] * 4}
+            file.write(json.dumps({"tick": k, "frame": {**frame, "quality": [0.1] * 4}}) + "\n")
 
 
 @pytest.mark.realtime
-def test_the_lab_pc_runs_a_model_without_the_packages_that_made_it(clean, model_file):
+def test_dry_run_works_without_the_packages_of_training(clean, model_file):
     """onnxruntime, the golden pairs, the loop and the log, on recorded frames and without a board."""
     (clean / "robot.toml").write_text((ROOT / "runtime/robots/pneumatic-3.toml").read_text())
     shutil.copy(model_file, clean / "model.onnx")
-    hanging_still(clean / "run.jsonl")
+    write_robot_at_rest(clean / "run.jsonl")
     replayed = ("--dry-run", "--yes", "--steps", "4", "--tracker", "replay", "--tracker-port", "run.jsonl")
     subprocess.run([clean / "venv/bin/modsoft-runtime", *replayed], cwd=clean, check=True)
     log = next((clean / "runs").glob("*/run.jsonl")).read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Without what only POSIX systems have, everything but the rig works. tests/shared/posix_hidden hides it."""
+"""Everything but the rig works without POSIX. tests/shared/posix_hidden hides the POSIX modules and functions."""
 
 import ast
 import json
@@ -16,7 +16,7 @@ PORTABLE = ("runtime", "training", "export", "tools/study")
 
 
 def run(folder, *command, expect=0):
-    """Runs a command in `folder` with POSIX hidden from it and from its child processes."""
+    """Runs a command in `folder`; hides POSIX from it and from its child processes."""
     environment = {**os.environ, "PYTHONPATH": str(HIDDEN), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, *map(str, command)],
@@ -34,18 +34,18 @@ def run(folder, *command, expect=0):
 
 
 def command(name, *arguments):
-    """`python -c` for a console script, which may have another name on another system."""
-    where = {
+    """`python -c` for a console script, whose file name differs between systems."""
+    module = {
         "modsoft-runtime": "runtime.cli",
         "modsoft-collect": "training.collect_cli",
         "modsoft-hil": "hil.cli",
         "modsoft-train": "training.train_cli",
         "modsoft-export": "export.cli",
     }[name]
-    return ("-c", f"from modsoft.{where} import main\nif __name__ == '__main__':\n    main()", *arguments)
+    return ("-c", f"from modsoft.{module} import main\nif __name__ == '__main__':\n    main()", *arguments)
 
 
-def test_posix_is_hidden_from_workers_too(tmp_path):
+def test_posix_is_hidden_from_workers(tmp_path):
     (tmp_path / "script.py").write_text(
         "import importlib, os, signal\n"
         "from modsoft.training.data import workers\n"
@@ -73,7 +73,7 @@ def test_every_module_can_be_imported(tmp_path):
     run(tmp_path, "-c", code)
 
 
-def test_collecting_training_and_exporting_run_to_their_end(tmp_path):
+def test_collection_training_and_export_complete(tmp_path):
     for package in ("torch", "h5py", "onnx", "elastica"):
         pytest.importorskip(package)
     collecting = ("--robot", "pneumatic-2", "--samples", "320", "--steps", "10", "--jobs", "2", "--out", "data.h5")
@@ -97,8 +97,8 @@ def test_tests_of_the_portable_parts_can_be_collected():
     assert done.returncode == 0, done.stdout[-3000:]
 
 
-def hanging_still(path, tools):
-    """Writes a run's log with six seconds of frames in which the tools hang straight under each other."""
+def write_robot_at_rest(path, tools):
+    """Writes a run log with frames of six seconds in which a robot with this number of tools hangs straight."""
     noise = random.Random(1)
     with path.open("w", encoding="utf-8") as file:
         for k in range(120):
@@ -111,8 +111,8 @@ def hanging_still(path, tools):
 
 
 @pytest.mark.realtime
-def test_a_dry_run_on_recorded_frames_runs_to_its_end(tmp_path, model_file):
-    hanging_still(tmp_path / "run.jsonl", tools=4)
+def test_dry_run_on_recorded_frames_completes(tmp_path, model_file):
+    write_robot_at_rest(tmp_path / "run.jsonl", tools=4)
     source = ("--tracker", "replay", "--tracker-port", "run.jsonl", "--robot", "pneumatic-3", "--model", model_file)
     done = run(tmp_path, *command("modsoft-runtime", "--dry-run", "--task", "edge", "--steps", "4", *source))
     assert "4 of 4 control steps" in done.stderr
@@ -120,7 +120,7 @@ def test_a_dry_run_on_recorded_frames_runs_to_its_end(tmp_path, model_file):
     assert not set(folder.name) & set('<>:"|?*\\'), "Windows has no such file names"
 
 
-def test_the_rig_asks_for_linux_in_one_line(tmp_path, model_file):
+def test_rig_on_another_system_is_refused_in_one_line(tmp_path, model_file):
     arguments = ("--robot", "pneumatic-3", "--model", model_file, "--task", "edge", "--report", "report")
     [line] = run(tmp_path, *command("modsoft-hil", *arguments), expect=69).stderr.splitlines()
     assert line.startswith("modsoft-hil: the rig needs Linux")
@@ -128,7 +128,7 @@ def test_the_rig_asks_for_linux_in_one_line(tmp_path, model_file):
 
 
 def opens_text_in_the_systems_encoding(call):
-    """Whether a call opens a text file without naming its encoding, which on Windows would not be UTF-8."""
+    """Whether a call opens a text file without an encoding, which would not be UTF-8 on Windows."""
     name = getattr(call.func, "attr", getattr(call.func, "id", ""))
     is_method = isinstance(call.func, ast.Attribute)
     modes = [argument.value for argument in call.args if isinstance(argument, ast.Constant)]

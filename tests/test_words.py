@@ -1,4 +1,4 @@
-"""The word list of `make check`: which spellings of a refused word it finds."""
+"""The word list of `make check`: the spellings of a refused word that it detects."""
 
 import importlib.util
 from pathlib import Path
@@ -30,7 +30,7 @@ def test_refused_word_is_found(text):
 @pytest.mark.parametrize(
     "text", ["colours", "discoloured", "bright or red", "brightred", "colour = 1  # words: old names", ""]
 )
-def test_other_words_are_kept(text):
+def test_other_words_are_accepted(text):
     assert list(words.findings(text, {"colour": "color", "bright red": "red"})) == []
 
 

@@ -1,7 +1,7 @@
-"""Builds wheel and source distribution into dist/, then installs and runs them as users do: `make dist`.
+"""Builds the wheel and the source distribution into dist/, then installs and runs them as users do: `make dist`.
 
-Each is installed into an environment of its own: the wheel, the source distribution with a C compiler, and the source
-distribution without one, where PyElastica has to replace the compiled kernel.
+Three new environments: the wheel, the source distribution with a C compiler, and the source distribution without one,
+where PyElastica replaces the compiled kernel.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def check(archive: Path, has_compiler: bool) -> None:
         expect("0." in run("modsoft-runtime", "--version"), "the version")
         (folder / "robot.toml").write_text(run("modsoft-runtime", "--print-robot", "pneumatic-3"), encoding="utf-8")
         run("modsoft-runtime", "--check", "robot.toml")
-        recording(folder / "recording.jsonl")
+        write_recording(folder / "recording.jsonl")
         run(
             "modsoft-runtime",
             "--dry-run",
@@ -84,8 +84,8 @@ def expect(holds: bool, what: str) -> None:
         raise SystemExit(f"dist: not as expected: {what}")
 
 
-def recording(path: Path) -> None:
-    """Frames of six seconds in which the tools hang straight under each other."""
+def write_recording(path: Path) -> None:
+    """Writes a run log with frames of six seconds in which the robot hangs straight."""
     with path.open("w", encoding="utf-8") as file:
         for k in range(120):
             poses = [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 50.0 * tool], [0, 0, 0, 1]] for tool in range(TOOLS)]

@@ -1,13 +1,13 @@
 #!/bin/sh
-# Installs everything into .venv: `make install`. Debian packages come through apt where that is allowed, else the one
-# line to run is printed. Safe to run again; does nothing where everything is there.
+# Installs everything into .venv: `make install`. Installs missing Debian packages with apt if that is allowed, else
+# prints the command to run. Can be repeated; does nothing if everything is installed.
 set -eu
 cd "$(dirname "$0")/.."
 
 compiler="gcc libc6-dev"
 board="gcc-avr avr-libc arduino-core-avr libsimavr-dev libelf1"
 
-# A file that each package brings: asked for directly, so that other ways of having it count too.
+# Each package is detected by one of its files, so that other ways of installing it count too.
 missing=""
 add() { missing="$missing $1"; }
 
@@ -46,31 +46,31 @@ if [ -n "$missing" ]; then
         case $missing in
         *venv* | *libc6-dev*) exit 69 ;;
         esac
-        echo "install: going on without the emulated MEGA; the native board takes its place" >&2
+        echo "install: continuing without the emulated MEGA; the native board replaces it" >&2
     fi
 fi
 
 # Without it one test is skipped: the sketch compiled as the Arduino IDE does.
 if ! command -v arduino-builder >/dev/null 2>&1 && [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null 2>&1; then
     DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends -qq arduino-builder >/dev/null 2>&1 ||
-        echo "install: no arduino-builder to be had; the test of the sketch in the Arduino IDE will be skipped"
+        echo "install: arduino-builder is not available; the test of the sketch in the Arduino IDE will be skipped"
 fi
 
 here=$(pwd -P)
 case $here in
 *:*)
-    echo "install: $here: Python's environments take no folder with a colon in its path; move the checkout" >&2
+    echo "install: $here: Python's environments do not allow a colon in their path; move the checkout" >&2
     exit 69
     ;;
 *[\$\`\"]*)
-    echo "install: $here: .venv/bin/activate does not work below such a name; call .venv/bin/modsoft-... instead" >&2
+    echo "install: $here: .venv/bin/activate does not work in such a folder; call .venv/bin/modsoft-... instead" >&2
     ;;
 esac
 existing=""
 [ ! -d .venv ] || existing=yes
 [ -x .venv/bin/python ] || "$python" -m venv .venv
 if [ -n "$existing" ] && [ "$(cat .venv/.installed 2>/dev/null)" != "$here" ]; then
-    .venv/bin/python tools/move_environment.py .venv # it came with a checkout that was copied or moved
+    .venv/bin/python tools/move_environment.py .venv # the checkout was copied or moved
 fi
 echo "install: Python packages into .venv"
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --use-pep517 -c constraints.txt -e '.[dev]'

@@ -1,5 +1,5 @@
-"""Lets a virtual environment that was copied or moved with its checkout refer to the place where it is now:
-`.venv/bin/python tools/move_environment.py .venv`. The installation of modsoft itself is made again by pip."""
+"""Updates the paths in a virtual environment that was copied or moved with its checkout:
+`.venv/bin/python tools/move_environment.py .venv`. Afterwards pip has to install modsoft again."""
 
 import re
 import subprocess
@@ -11,7 +11,7 @@ HEAD = re.compile(rb"""\A(#!/bin/sh\n'''exec' "[^\n]*\n' '''\n|#![^\n]*python[^\
 
 
 def head(python: Path) -> bytes:
-    """For any path: a line for the shell that Python takes for a text."""
+    """First lines of a script, for any path: the shell runs the interpreter, Python reads them as a string."""
     quoted = re.sub(r'([$`"\\])', r"\\\1", str(python))
     return f"#!/bin/sh\n'''exec' \"{quoted}\" \"$0\" \"$@\"\n' '''\n".encode()
 

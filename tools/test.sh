@@ -1,5 +1,5 @@
 #!/bin/sh
-# The whole suite, in three parts: `make test`. Each part runs even where one before it failed.
+# Runs the whole suite in three parts: `make test`. Each part runs even if an earlier one failed.
 set -u
 cd "$(dirname "$0")/.."
 failed=0
@@ -12,7 +12,7 @@ part() {
 
 part "all but the tests against the wall clock" -n 2 --dist worksteal -m "not realtime and not cluster"
 
-# What computes with torch, its libraries or our kernel, as on a processor without AVX-512 and AMX.
+# Tests that compute with torch, its libraries or our kernel run again as on a processor without AVX-512 and AMX.
 if grep -q avx512f /proc/cpuinfo 2>/dev/null; then
     (
         export ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2 MKL_ENABLE_INSTRUCTIONS=AVX2 MODSOFT_KERNEL=avx2

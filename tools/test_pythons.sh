@@ -2,7 +2,7 @@
 # Runs the tests of runtime and export on every Python from 3.11 to 3.13 that is found: make test-python. Each has an
 # environment of its own, build/python-VERSION; one that has the version of .venv uses that.
 # NO_TORCH=1 installs no torch, which takes several GB for each Python: then only the tests of runtime run, with models
-# that a Python with torch made before.
+# that a Python with torch exported before.
 set -eu
 cd "$(dirname "$0")/.."
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"

@@ -1,4 +1,4 @@
-"""tools/bench/loop.py and latency.py: the figures of known times, and a real run of each."""
+"""tools/bench/loop.py and latency.py: figures computed from known times, and a short real run of each."""
 
 import json
 import subprocess
@@ -38,7 +38,7 @@ def test_lateness_skipped_ticks_and_bursts_are_counted(loop):
     assert figures["shortest_gap"] == pytest.approx(0.012 / 0.04)
 
 
-def test_lateness_of_the_others_is_divided_by_ours(loop):
+def test_ratios_divide_the_lateness_of_other_loops_by_ours(loop):
     rows = [
         {"busy": 0, "hz": 25.0, "pace": pace, "p50_ms": p50, "p99_ms": 1.0}
         for pace, p50 in (("our ticker", 0.1), ("asyncio", 0.5))
@@ -49,7 +49,7 @@ def test_lateness_of_the_others_is_divided_by_ours(loop):
 
 
 @pytest.mark.realtime
-def test_all_loops_run_at_once(loop, tmp_path):
+def test_every_loop_is_measured(loop, tmp_path):
     command = [sys.executable, benchmarks.BENCH / "loop.py", "--seconds", "1", "--json", tmp_path / "figures"]
     output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout
     rows = json.loads((tmp_path / "figures").read_text())["rows"]
@@ -63,7 +63,7 @@ def test_all_loops_run_at_once(loop, tmp_path):
 # ---- Latency
 
 
-def test_stages_add_up_to_the_whole(latency_stages):
+def test_stages_add_up_to_the_total(latency_stages):
     line = {"taken": 2.0, "features": 2.001, "actuation": 2.003, "pressures": 2.004, "number": 7}
     writes, changes = np.array([1.0, 2.006, 3.0]), np.array([1.5, 2.009, 2.010])
     row = latency_stages.stages(line, {7: (1.9, 1.9005)}, writes, changes, 0.002)
@@ -74,13 +74,13 @@ def test_stages_add_up_to_the_whole(latency_stages):
 
 
 @pytest.mark.parametrize("changes", [[], [2.0075], [2.2]], ids=["none", "before the last byte", "much later"])
-def test_ticks_without_a_clear_effect_are_left_out(latency_stages, changes):
+def test_ticks_without_a_clear_effect_are_skipped(latency_stages, changes):
     line = {"taken": 2.0, "features": 2.001, "actuation": 2.003, "pressures": 2.004, "number": 7}
     assert latency_stages.stages(line, {7: (1.9, 1.9005)}, np.array([2.006]), np.array(changes), 0.002) is None
 
 
 @pytest.mark.parametrize("modules", [2, 3, 5])
-def test_oscillating_robot_has_the_poses_of_a_robot(latency_stages, modules):
+def test_oscillating_poses_have_the_given_bending_angles(latency_stages, modules):
     robot = latency_stages.robot_of(modules, 7.0)
     assert (robot.modules, len(robot.chambers), robot.loop.hz) == (modules, 2 * modules, 7.0)
     angles = bending_angle_deg(from_poses(np.array(latency_stages.oscillating(modules, 0.4))))

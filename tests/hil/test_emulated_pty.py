@@ -1,4 +1,4 @@
-"""The serial port of the emulated board: opening, bootloader, DTR, rates, noise, the cable."""
+"""The serial port of the emulated board: opening, bootloader, DTR, baud rates, noise, unplugging."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.realtime
 
 
 def wait_for_hello(port: serial.Serial, timeout_s: float = HELLO_TIMEOUT_S) -> tuple[Hello, float]:
-    """HELLO, and how long it took in host time."""
+    """Returns HELLO and the host time until it arrived."""
     parser, start = Parser(), time.monotonic()
     while time.monotonic() - start < timeout_s:
         for frame in parser.feed(port.read(128)):
@@ -40,13 +40,13 @@ def test_quiet_open_gets_a_hello_through_the_bootloader() -> None:
 
 
 @pytest.mark.usefixtures("simavr")
-def test_a_host_that_talks_at_once_stays_in_the_bootloader() -> None:
+def test_bytes_after_opening_keep_the_board_in_the_bootloader() -> None:
     with EmulatedBoard("simavr") as board, serial.Serial(board.port, BAUD, timeout=0.3, exclusive=True) as port:
-        parser, heard = Parser(), []
+        parser, received = Parser(), []
         for _ in range(7):  # 2.1 s: more than twice the time a quiet host has to wait
             port.write(encode(HelloReq(PROTOCOL_HASH)))
-            heard += parser.feed(port.read(64))
-        assert heard == []
+            received += parser.feed(port.read(64))
+        assert received == []
         port.timeout = 0.01
         silent_s = wait_for_hello(port, 8)[1]
         print(f"out of the bootloader after {silent_s:.2f} s of silence")
@@ -54,7 +54,7 @@ def test_a_host_that_talks_at_once_stays_in_the_bootloader() -> None:
     assert board.summary["rx_bootloader"] == 7 * len(encode(HelloReq(PROTOCOL_HASH)))
 
 
-def test_every_open_resets_and_has_its_own_boot_id(board_name: str) -> None:
+def test_every_opening_resets_the_board_and_increments_the_boot_id(board_name: str) -> None:
     with EmulatedBoard(board_name) as board:
         ids = []
         for _ in range(2):
@@ -69,7 +69,7 @@ def test_every_open_resets_and_has_its_own_boot_id(board_name: str) -> None:
     ]
 
 
-def test_power_cycle_loses_the_memory_of_former_boots(board_name: str) -> None:
+def test_power_cycle_starts_with_a_new_boot_id(board_name: str) -> None:
     with EmulatedBoard(board_name) as board, serial.Serial(board.port, BAUD, timeout=0.01) as port:
         first = wait_for_hello(port)[0]
         board.send("power-cycle")
@@ -96,7 +96,7 @@ def test_wrong_rate_gives_noise(board_name: str) -> None:
         assert Parser().feed(received) == []
 
 
-def test_cable_pulled_and_plugged_in_elsewhere(board_name: str, tmp_path: Path) -> None:
+def test_board_can_be_unplugged_and_plugged_in_at_another_port(board_name: str, tmp_path: Path) -> None:
     with EmulatedBoard(board_name) as board:
         port = serial.Serial(board.port, BAUD, timeout=0.5)
         wait_for_hello(port)
@@ -113,7 +113,7 @@ def test_cable_pulled_and_plugged_in_elsewhere(board_name: str, tmp_path: Path) 
             wait_for_hello(port)
 
 
-def test_flood_comes_at_line_rate_and_the_firmware_outlives_it(board_name: str) -> None:
+def test_flood_arrives_at_line_rate_and_the_firmware_replies_after_it(board_name: str) -> None:
     with EmulatedBoard(board_name) as board, serial.Serial(board.port, BAUD, timeout=0.01) as port:
         wait_for_hello(port)
         board.send("flood 1000")

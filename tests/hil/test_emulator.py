@@ -1,4 +1,4 @@
-"""The emulated board as a process: building, starting, its clock, its end."""
+"""The emulated board as a process: building, starting, clock, stopping."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert toolchain.choose("auto") == "native"
 
 
-def test_a_checkout_of_another_user_is_built_elsewhere() -> None:
+def test_read_only_checkout_is_built_in_a_temporary_folder() -> None:
     code = (
         "from modsoft.runtime import process\n"
         "process.is_writable = lambda folder: False\n"
@@ -34,7 +34,7 @@ def test_a_checkout_of_another_user_is_built_elsewhere() -> None:
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
     for path in done.stdout.split():
         assert not Path(path).is_relative_to(toolchain.ROOT)
-        assert not Path(path).exists(), "it ends with its process"
+        assert not Path(path).exists(), "deleted at the end of the process"
 
 
 def test_unknown_board_is_refused() -> None:
@@ -52,34 +52,34 @@ def test_sources_compile_without_a_warning(board_name: toolchain.BoardName, tmp_
 
 
 @pytest.mark.usefixtures("simavr")
-def test_firmware_that_cannot_be_read_ends_in_one_line(tmp_path: Path) -> None:
+def test_unreadable_firmware_is_one_line(tmp_path: Path) -> None:
     broken = tmp_path / "broken.hex"
     broken.write_text("no hex\n")
     with pytest.raises(DeviceAbsent, match=r"did not start: board: .*broken\.hex is not a readable Intel hex file"):
         EmulatedBoard("simavr", firmware=broken).start()
 
 
-def test_a_file_in_the_place_of_the_port_is_kept(board_name: str, tmp_path: Path) -> None:
-    precious = tmp_path / "ttyMEGA"
-    precious.write_text("mine")
+def test_existing_file_is_not_replaced_by_the_port(board_name: str, tmp_path: Path) -> None:
+    existing = tmp_path / "ttyMEGA"
+    existing.write_text("mine")
     with pytest.raises(DeviceAbsent, match=r"did not start: board: cannot make the port link .*File exists"):
-        EmulatedBoard(board_name, port_link=precious).start()
-    assert precious.read_text() == "mine"
+        EmulatedBoard(board_name, port_link=existing).start()
+    assert existing.read_text() == "mine"
 
 
 # ---- Process and clock ------------------------------------------------------------------------------------------
 
 
-def test_board_ends_with_its_starter(board_name: str) -> None:
+def test_board_ends_with_its_parent_process(board_name: str) -> None:
     script = (
         "from modsoft.hil.board.emulator import EmulatedBoard; import sys, time\n"
         f"board = EmulatedBoard({board_name!r}).start(); print(board.pid, board.port, flush=True); time.sleep(60)"
     )
-    starter = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-    assert starter.stdout is not None
-    pid, link = starter.stdout.readline().split()
-    starter.kill()
-    starter.wait()
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid, link = parent.stdout.readline().split()
+    parent.kill()
+    parent.wait()
     deadline = time.monotonic() + 5
     while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -88,7 +88,7 @@ def test_board_ends_with_its_starter(board_name: str) -> None:
 
 
 @pytest.mark.realtime
-def test_emulated_time_keeps_up_with_real_time(board_name: str, record_property: Any) -> None:
+def test_emulated_time_follows_real_time(board_name: str, record_property: Any) -> None:
     with EmulatedBoard(board_name) as board:
         time.sleep(2)
     summary = board.summary
@@ -103,7 +103,7 @@ def test_emulated_time_keeps_up_with_real_time(board_name: str, record_property:
 
 @pytest.mark.realtime
 @pytest.mark.usefixtures("simavr")
-def test_fast_outruns_real_time() -> None:
+def test_fast_board_is_faster_than_real_time() -> None:
     with EmulatedBoard("simavr", fast=True, bootloader=False) as board:
         time.sleep(0.5)
     assert board.summary["percent_of_real_time"] > 200
@@ -111,7 +111,7 @@ def test_fast_outruns_real_time() -> None:
 
 
 @pytest.mark.usefixtures("simavr")
-def test_a_command_that_makes_no_sense_is_refused() -> None:
+def test_invalid_command_is_refused() -> None:
     with EmulatedBoard("simavr") as board:
         for command in ("adc 8 100", "adc 0 6000", "drop-rx 2", "hum", "hang"):  # hang: still in the bootloader
             board.send(command)

@@ -28,15 +28,15 @@ FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 class Disk:
-    """`os.write` of a disk that is full from byte `begins` to byte `ends` of what it is asked to write."""
+    """`os.write` to a disk that is full while the number of requested bytes is between `begins` and `ends`."""
 
     def __init__(self, begins, ends):
-        self.begins, self.ends, self.asked = begins, ends, 0
+        self.begins, self.ends, self.requested = begins, ends, 0
 
     def write(self, file, data):
-        self.asked += len(data)
-        room = self.begins - self.asked + len(data)
-        if self.asked >= self.ends or room >= len(data):
+        self.requested += len(data)
+        room = self.begins - self.requested + len(data)
+        if self.requested >= self.ends or room >= len(data):
             return os.write(file, data)
         if room > 0:
             return os.write(file, data[:room])
@@ -44,7 +44,7 @@ class Disk:
 
 
 def sent_with(write, path, steps=200):
-    """All that a run sends, and its log's writer."""
+    """Runs the loop with a log written by `write`; returns everything that it sends, and the log's writer."""
     world, writer = World(steps=steps), logs.Writer(path, write)
     world.answer = lambda features: np.full((3, 1), 0.3 * np.sin(len(world.features)))
     world.log = writer.put
@@ -53,40 +53,40 @@ def sent_with(write, path, steps=200):
 
 
 def test_row_25_disk_full(matrix_row, full, tmp_path):
-    sound, writer = sent_with(os.write, tmp_path / "sound.jsonl")
+    expected, writer = sent_with(os.write, tmp_path / "without_fault.jsonl")
     writer.close()
-    assert (len(sound), writer.lost) == (201, 0)
-    size = (tmp_path / "sound.jsonl").stat().st_size
-    rng, tries, untold = np.random.default_rng(25), 200 if full else 10, 0
+    assert (len(expected), writer.lost) == (201, 0)
+    size = (tmp_path / "without_fault.jsonl").stat().st_size
+    rng, tries, unreported = np.random.default_rng(25), 200 if full else 10, 0
     for number in range(tries):
         begins = rng.integers(0, size // 2)
         disk = Disk(begins, begins + rng.integers(size // 4, size))
-        found, writer = sent_with(disk.write, tmp_path / f"{number}.jsonl")
+        sent, writer = sent_with(disk.write, tmp_path / f"{number}.jsonl")
         writer.close()
-        assert found == sound, "same set-points at the same times"
-        untold += not (writer.lost and writer.error == FULL.strerror)
+        assert sent == expected, "same set-points at the same times"
+        unreported += not (writer.lost and writer.error == FULL.strerror)
     freed = threading.Event()
     steps = logs.QUEUE_LINES + 100
-    found, writer = sent_with(lambda file, data: freed.wait(60) and len(data), tmp_path / "hangs.jsonl", steps)
+    sent, writer = sent_with(lambda file, data: freed.wait(60) and len(data), tmp_path / "hangs.jsonl", steps)
     lost = writer.lost
     freed.set()
     writer.close()
-    assert (len(found), found[:201]) == (steps + 1, sound)
+    assert (len(sent), sent[:201]) == (steps + 1, expected)
     assert lost >= 100
     matrix_row(
         25,
         fault="disk full, or hanging, while logging",
         tries=tries + 1,
-        limit="control goes on, no late tick, the log says so",
-        worst=f"same commands, {untold} untold",
+        limit="control continues, no late tick, the log reports it",
+        worst=f"same commands, {unreported} unreported",
         clock="virtual",
     )
-    assert untold == 0
+    assert unreported == 0
 
 
 @pytest.mark.realtime
 def test_row_25_disk_full_in_a_run(matrix_row, full, model_file, tmp_path):
-    """The kernel refuses to make any file of the process longer, from some instant on."""
+    """From a random time on, the kernel refuses to extend any file of the process."""
     phases_s = np.random.default_rng(25).uniform(0.0, 2.0, 20 if full else 3)
 
     @retry_until_begun
@@ -110,7 +110,7 @@ def test_row_25_disk_full_in_a_run(matrix_row, full, model_file, tmp_path):
         25,
         fault="no room for the log, in a run",
         tries=len(phases_s),
-        limit="control goes on, no tick missed, the terminal says so",
+        limit="control continues, no tick missed, the terminal reports it",
         worst=f"15 of 15 steps, latest tick {worst_ms:.1f} ms",
         clock="host",
     )
@@ -120,7 +120,7 @@ def test_row_25_disk_full_in_a_run(matrix_row, full, model_file, tmp_path):
 
 
 def starved(rng):
-    """A world whose process is halted now and then: in a wait, in a step, or just before its command is out."""
+    """A world whose process halts at random: in a wait, in a step, or just before it sends its command."""
     world = World(steps=15)
     wait, often = world.wait, rng.choice([0.02, 0.1, 0.3])
 
@@ -155,7 +155,7 @@ def test_row_26_starved_processor(matrix_row, full):
             reason = str(error)
         except LostInRun as error:
             reason = str(error)
-            assert "no new frame" in reason  # it was away for as long as a tracker may be
+            assert "no new frame" in reason  # it halted for longer than the tracker may be silent
         least_s = min(least_s, *(b - a for (a, *_), (b, *_) in itertools.pairwise(world.sent)), np.inf)
         sets += len(world.sent)
         ran = [record.tick for record in world.ticks]
@@ -178,13 +178,13 @@ def test_row_26_starved_processor(matrix_row, full):
 
 
 def longest_silence(ticks):
-    """Of the ticks in a row that sent nothing, the most."""
-    most = now = 0
+    """The largest number of ticks in a row that sent nothing."""
+    longest = current = 0
     for record in ticks:
-        now = now + record.missed if record.sent else now + record.missed + 1
-        most = max(most, now)
-        now = 0 if record.sent else now
-    return most
+        current = current + record.missed if record.sent else current + record.missed + 1
+        longest = max(longest, current)
+        current = 0 if record.sent else current
+    return longest
 
 
 # ---- Row 27
@@ -206,12 +206,12 @@ def test_row_27_wall_clock_steps(matrix_row, full, model_file, tmp_path, steppin
     @retry_until_begun
     def attempt(number, again=2):
         """Every run but the first has a wall clock that steps."""
-        folder, how = tmp_path / f"{number}-{again}", {"env": stepping} if number else {}
-        with Stand() as stand, Run(stand, model_file, folder, "--steps", str(steps), **how) as run:
+        folder, options = tmp_path / f"{number}-{again}", {"env": stepping} if number else {}
+        with Stand() as stand, Run(stand, model_file, folder, "--steps", str(steps), **options) as run:
             code, _ = run.wait_exit()
         log = run.log()
         if again and (code, len(log.ticks)) != (0, steps):
-            return attempt(number, again - 1)  # a starved host misses ticks, and then its commands are others
+            return attempt(number, again - 1)  # a starved host misses ticks, which changes its commands
         assert code == 0, run.output
         walls = [datetime.fromisoformat(record.wall).timestamp() for record in log.ticks]
         stepped = sum(abs(b - a - PERIOD_S) > 60 for a, b in itertools.pairwise(walls))
@@ -220,8 +220,8 @@ def test_row_27_wall_clock_steps(matrix_row, full, model_file, tmp_path, steppin
         return [record.commanded_bar.tolist() for record in log.ticks], stepped
 
     results = side_by_side(tries + 1, attempt, 3)
-    (calm, _), *others = results
-    differ = sum(a != b for commands, _ in others for a, b in zip(commands, calm, strict=True))
+    (expected, _), *others = results
+    differ = sum(a != b for commands, _ in others for a, b in zip(commands, expected, strict=True))
     matrix_row(
         27,
         fault="wall clock steps by up to an hour, three times a second",
@@ -231,4 +231,4 @@ def test_row_27_wall_clock_steps(matrix_row, full, model_file, tmp_path, steppin
         clock="host",
     )
     assert differ == 0
-    assert len({str(bar) for bar in calm}) > steps / 2, "commands that never change show nothing"
+    assert len({str(bar) for bar in expected}) > steps / 2, "constant commands would always be identical"

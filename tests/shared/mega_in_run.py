@@ -103,7 +103,7 @@ def inject(emulated, command, name="command"):
 
 
 def side_by_side(tries, attempt, at_once=5):
-    """Results of `attempt(number)` for every number below `tries`, several at once: a board is mostly idle."""
+    """Results of `attempt(number)` for every number below `tries`, `at_once` in parallel: a board is mostly idle."""
     with ThreadPoolExecutor(at_once) as pool:
         return list(pool.map(attempt, range(tries)))
 

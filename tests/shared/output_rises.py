@@ -1,8 +1,8 @@
-"""How often the valve outputs of an emulated board went up."""
+"""Counts increases of the valve outputs of an emulated board."""
 
 
 def rises(trace, since=0):
-    """How often an output of any channel went up in `trace[since:]`, against its duty before."""
+    """Number of events in `trace[since:]` that raise the duty of a channel above its previous one."""
     duties = {}
     count = 0
     for index, event in enumerate(trace):

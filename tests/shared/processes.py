@@ -1,4 +1,4 @@
-"""Who started whom, from /proc."""
+"""Child processes, read from /proc."""
 
 from pathlib import Path
 
@@ -7,9 +7,9 @@ import host_load
 
 def descendants(pid):
     """Process ids below `pid`, without the tests' own host-load check."""
-    found = []
+    pids = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         children = set(map(int, task.read_text().split())) - host_load.SLEEPERS
         for child in children:
-            found += [child, *descendants(child)]
-    return found
+            pids += [child, *descendants(child)]
+    return pids

@@ -1,4 +1,4 @@
-"""modsoft-runtime as a process of its own on an emulated board and the fake tracker, for faults of host and tracker."""
+"""modsoft-runtime as a process on an emulated board and an emulated tracker, for faults of host and tracker."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BEGIN_S = 30.0  # until the first tick, on a busy machine
 LEAVE_S = 40.0  # the runtime waits 6 s for a lost board; a short task runs to its end
 
 
-# Makes standard input the terminal of a new session, as a terminal's window does, and becomes the program.
+# Makes standard input the controlling terminal of a new session, then executes the program.
 OWN_TERMINAL = """
 import fcntl, os, sys, termios
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
@@ -36,11 +36,11 @@ class NeverBegan(AssertionError):
     """modsoft-runtime did not reach arming: on a busy machine the emulated board may start too late."""
 
 
-def retry_until_begun(attempt, again=4):
-    """`attempt`, repeated while its run never began."""
+def retry_until_begun(attempt, tries=4):
+    """`attempt`, repeated until its run reaches arming, at most `tries` times."""
 
     def repeated(*arguments):
-        for left in reversed(range(again)):
+        for left in reversed(range(tries)):
             try:
                 return attempt(*arguments)
             except NeverBegan:
@@ -53,7 +53,7 @@ def retry_until_begun(attempt, again=4):
 class Stand:
     """Context manager: a board, and a tracker that sees a robot at rest.
 
-    Needs far less of a core than the rig, which simulates the robot: several of them run side by side.
+    Needs far less processor time than the rig, which simulates the robot: several run in parallel.
     """
 
     def __init__(self, board="auto", angles_deg=(1.0, 2.0, -3.0), tracker_options=()):
@@ -92,7 +92,7 @@ class Stand:
 
 
 class Run:
-    """Context manager: modsoft-runtime on a stand; killed at the end if it still runs.
+    """Context manager: modsoft-runtime on a `Stand`; killed at the end if it still runs.
 
     program: the command; `FAULTY` for faults in the process itself.
     """
@@ -157,7 +157,7 @@ class Run:
         return self._follower.last
 
     def armed(self):
-        """Whether the log is open, which is just before arming."""
+        """Whether the log exists; the runtime creates it just before arming."""
         return any(self.runs.glob("*/run.jsonl"))
 
     def ticks(self):

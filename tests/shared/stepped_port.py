@@ -1,4 +1,4 @@
-"""A serial port on a stepped emulated board: host and board share its clock, so a busy machine disturbs neither."""
+"""A serial port on a stepped emulated board. Host and board share its clock, so the load of the PC has no effect."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import serial
 from modsoft.hil.board.emulator import EmulatedBoard
 
 STEP_US = 5000  # a read of the runtime's port waits 5 ms
-BUFFERED_AT_MOST = 2048  # by a pseudo-terminal that no process reads; it has room for more
+BUFFERED_AT_MOST = 2048  # bytes in a pseudo-terminal that no process reads; its buffer is larger
 ARRIVES_IN_S = 1.0  # real time
 
 
@@ -21,7 +21,7 @@ class SteppedPort:
     """
 
     def __init__(self, board: EmulatedBoard, name: str = "", baud: int = 250_000) -> None:
-        """board: started with `stepped`. name: of the port, where it was plugged in again under another name."""
+        """board: started with `stepped`. name: the port's new name, if the board was plugged in again."""
         self.dtr = True
         self.written: list[tuple[float, bytes]] = []  # (clock, bytes)
         self._board = board
@@ -33,7 +33,7 @@ class SteppedPort:
         return float(self._board.last_run["t_us"]) * 1e-6
 
     def idle(self, seconds: float) -> None:
-        """Let time pass without reading."""
+        """Advances time without reading."""
         self._step(round(seconds * 1e6))
 
     @property

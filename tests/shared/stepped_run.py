@@ -1,7 +1,7 @@
-"""A run as modsoft-runtime makes it, from arming to the closed log, on the clock of a stepped board.
+"""A run of modsoft-runtime from arming to the closed log, on the clock of a stepped board.
 
-Board, loop, signals, venting and log are the runtime's own; tracker and model are what the test makes of them. Nothing
-of it is disturbed by a busy machine, and a cause can come at any instant. Needs the main thread, for the signals.
+Board, loop, signals, venting and log are the runtime's own; the test replaces tracker and model. The load of the PC
+has no effect, and a cause can come at any time. Needs the main thread, for the signals.
 """
 
 import contextlib
@@ -27,8 +27,8 @@ STEPS = 40
 
 
 class SteppedRun:
-    """`cause(run)` is called `cause_s` after the beginning of arming. After `go`: `error`, the exception
-    of the run, and `messages`, (emulated seconds, highest duty at that time, line) of all its messages."""
+    """Calls `cause(run)` at `cause_s` after the beginning of arming. After `go`: `error`, the exception of the run, and
+    `messages`, (emulated seconds, highest duty at that time, line) of all its messages."""
 
     history = 3  # of the model
 
@@ -46,7 +46,7 @@ class SteppedRun:
 
     def pump(self):
         """A turn of the port's thread; lets time pass."""
-        going_on = self._pump()
+        works = self._pump()
         if self.frames.error is None:
             at_s = self.clock()
             frame = TrackerFrame(int(at_s * 60), at_s, planar_poses((1.0, 2.0, 3.0)), np.ones(4, bool), np.full(4, 0.1))
@@ -54,7 +54,7 @@ class SteppedRun:
         if self.cause is not None and self.clock() >= self.cause_s:
             cause, self.cause, self.caused_s = self.cause, None, self.clock()
             cause(self)
-        return going_on
+        return works
 
     def wait(self, seconds):
         until_s = self.clock() + seconds
@@ -97,7 +97,7 @@ class SteppedRun:
                     error = raised
                 with contextlib.closing(self.board):
                     shutdown.finish(self.board, self.log, self.statistics, self.frames, error)
-        except BaseException as raised:  # noqa: BLE001 - looked at by the test
+        except BaseException as raised:  # noqa: BLE001 - checked by the test
             self.error = raised
         finally:
             shutdown.say = say

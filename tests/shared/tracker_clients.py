@@ -1,4 +1,4 @@
-"""Clients of a tracker for tests of the process that runs them: functions of a module, as that process needs them."""
+"""Tracker clients for tests of the client process, which imports them by module and function name."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ from modsoft.runtime.tracking.frame import FrameError, TrackerFrame
 
 
 class Client:
-    """Frames number `first`, first + 1, ...; before the first of them and after `frames` of them it does `then`."""
+    """Returns frames number `first`, first + 1, ...; fails as `then` says after `frames` of them."""
 
     def __init__(self, folder, frames=5, then="end", first=0):
         self.folder, self.frames, self.then, self.number = Path(folder), frames, then, first
@@ -52,11 +52,11 @@ class Client:
 
 
 def once(folder, **options):
-    """Does what `then` says the first time it is opened, and gives frames from 0 on the times after."""
-    again = Path(folder) / "opened"
-    if again.exists():
+    """The first client fails as `then` says; later ones return frames from 0 without end."""
+    opened = Path(folder) / "opened"
+    if opened.exists():
         return Client(folder, frames=10**9)
-    again.touch()
+    opened.touch()
     return Client(folder, **options)
 
 

@@ -11,7 +11,7 @@ from modsoft.runtime.tracking.frame import TrackerFrame
 
 
 def tracker_frame(number: int, at_s: float, angles=(0.0, 0.0, 0.0), **changes) -> TrackerFrame:
-    """A frame without errors at 60 Hz, except for the parts in `changes`."""
+    """A frame without errors at 60 Hz, with `changes` of its fields."""
     poses = planar_poses(angles)
     parts = {"poses": poses, "valid": np.ones(len(poses), bool), "quality": np.full(len(poses), 0.1), "device_hz": 60.0}
     return TrackerFrame(number, at_s, **(parts | changes))

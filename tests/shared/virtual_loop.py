@@ -33,7 +33,7 @@ def planar_poses(angles_deg, module_mm=MODULE_MM):
     return _planar_poses(tuple(angles_deg), module_mm).copy()
 
 
-@functools.lru_cache(maxsize=1)  # most robots here hang still
+@functools.lru_cache(maxsize=1)  # most robots in tests are at rest
 def _planar_poses(angles_deg, module_mm):
     poses = [np.eye(4)]
     total, position = 0.0, np.zeros(3)
@@ -53,7 +53,7 @@ def _planar_poses(angles_deg, module_mm):
 
 
 class World:
-    """Virtual time with a robot that hangs still, a tracker of 60 Hz, a board and a model.
+    """Virtual time with a robot at rest, a tracker of 60 Hz, a board and a model.
 
     `at[step]` is called when that step is due, before the loop reads anything. `dark` and `corrupted` are faults of the
     tracker over time, exact at any time of reading: the tracker sees nothing in [from, to) of a `dark` pair, and the

@@ -5,7 +5,7 @@ each valve channel in [0, 1]; its end ends the process. Standard output, one JSO
 
     {"event": "ready"}                           the robot hangs at rest, time starts
     {"event": "state", "mono_ns", "t_s", ...}    every slice: `ValvesAndArm.state`; mono_ns is the CLOCK_MONOTONIC
-                                                 instant that the slice stands for
+                                                 time at which the state is due
     {"event": "summary", ...}                    slices, lateness
 
 The valves are ideal: a duty is that share of the full-scale pressure. Lag and chamber belong to `modsoft.training`.
@@ -32,7 +32,7 @@ from modsoft.runtime.errors import RobotFileError
 from modsoft.runtime.robot import Robot
 
 SLICE_S = 0.02
-# Where the tracker stands: the base's tool in its frame, 1.4 m in front and turned, so that a mistake in frames shows.
+# Pose of the base's tool in the tracker's frame: 1.4 m in front and turned, so that confused frames show.
 _TURN_Z, _TURN_X = np.radians(35.0), np.radians(-100.0)
 BASE_IN_TRACKER = np.eye(4)
 BASE_IN_TRACKER[:3, :3] = np.array(
@@ -42,7 +42,7 @@ BASE_IN_TRACKER[:3, 3] = [60.0, -110.0, -1400.0]  # mm
 
 
 class PneumaticArm(Protocol):
-    """What the plant asks of `modsoft.training.simulation.elastica.Arm`."""
+    """The part of `modsoft.training.simulation.elastica.Arm` that the plant uses."""
 
     @property
     def configuration(self) -> Array: ...  # (N, 3)
@@ -58,7 +58,7 @@ class PneumaticArm(Protocol):
 
 def set_points_bar(robot: Robot, duty: Array) -> Array:
     """Set-points of the chambers (N, 2), sides + and -, bar, from the duty of each valve channel (channels,)."""
-    assert robot.valve is not None  # load_robot takes no other
+    assert robot.valve is not None  # checked by load_robot
     set_points = np.zeros((robot.modules, 2))
     for chamber in robot.chambers:
         share = duty[chamber.channel] if chamber.channel < len(duty) else 0.0
@@ -124,9 +124,10 @@ def run(
     sleep: Callable[[float], None] = time.sleep,
     slice_s: float = SLICE_S,
 ) -> None:
-    """Slices at absolute deadlines until `duties` ends. `duties` gives the newest duties, or None where none came.
+    """Advances the plant in slices with absolute deadlines until `duties` ends. `duties` yields the newest duties, or
+    None if none arrived.
 
-    A late slice is not skipped: simulated time has to be real time again, so the next ones follow without a pause.
+    A late slice is not skipped: the next ones follow without a pause until simulated time equals real time.
     """
     duty = np.zeros(0)
     slices = late = 0
@@ -151,7 +152,7 @@ def run(
 
 
 def duties_from(descriptor: int) -> Iterator[Array | None]:
-    """The newest duties that stand in the pipe, None while there are none, ends at its end."""
+    """Yields the newest duties in the pipe, None while it is empty; ends when the pipe is closed."""
     pending = b""
     while True:
         newest = None
