@@ -23,7 +23,8 @@
 #define CHANNELS_USED 11
 #endif
 
-/* Bit c is set where channel c has a pressure sensor on analogue input A<c>; only A0 to A7 can be used. */
+/* Bit c is set where channel c has a pressure sensor on analogue input A<c>, A0 to A11. More than 5 V destroys an
+ * input. */
 #ifndef SENSORS
 #define SENSORS 0x003f
 #endif

@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define PROTOCOL_HASH 0x3be3d7b0UL
+#define PROTOCOL_HASH 0x4b221458UL
 
 #define PROTOCOL_DELIMITER 0
 #define PROTOCOL_MAX_DECODED 96
@@ -33,6 +33,7 @@ enum fault {
   FAULT_OVER_PRESSURE = 4,
   FAULT_LEAK = 8,
   FAULT_SENSOR = 16,
+  FAULT_SUPPLY = 32,
 };
 
 enum vent_mode {
@@ -48,6 +49,7 @@ enum nack_reason {
   NACK_REASON_SEQUENCE = 5,
   NACK_REASON_HASH = 6,
   NACK_REASON_TYPE = 7,
+  NACK_REASON_PRESSURE = 8,
 };
 
 enum reset_cause {
@@ -111,6 +113,10 @@ struct __attribute__((packed)) hello {
   int16_t p_max;
   int16_t p_down;
   uint32_t p_full;
+  uint16_t sensor_zero_mv;
+  uint16_t sensor_full_mv;
+  uint32_t sensor_full;
+  uint16_t supply_least_mv;
   uint16_t slew;
   uint16_t link_timeout_ms;
   uint16_t control_timeout_ms;

@@ -5,24 +5,24 @@
 #include "limits.h"
 #include "pins.h"
 
-#if SENSORS & ~0xff
-#error "SENSORS: only channels 0 to 7 can have one, on A0 to A7"
+#if SENSORS & ~0xfff
+#error "SENSORS: only channels 0 to 11 can have one, on A0 to A11"
 #endif
 
-#define INPUTS 8
+#define INPUTS PROTOCOL_CHANNELS
 /* After the last input, once in ROUNDS_PER_SUPPLY rounds: the 1.1 V reference, measured against the supply. It settles
  * slowly after it is selected, so its first conversion is discarded. */
 #define SETTLING INPUTS
 #define SUPPLY (INPUTS + 1)
-#define ROUNDS_PER_SUPPLY 64
-#define REFERENCE_MV 1100UL
-#define LEAST_READING 18 /* of the reference; less would be a supply of more than 62 V */
+#define ROUNDS_PER_SUPPLY 8 /* twice in SUPPLY_MS with 6 sensors, once with 12 */
+#define LEAST_READING 19    /* of the reference; less would be a supply of more than 59 V */
 
 static bool has_sensor(uint8_t input) { return (SENSORS >> input) & 1; }
 
 static void start(uint8_t input) {
   const uint8_t reference_input = _BV(MUX4) | _BV(MUX3) | _BV(MUX2) | _BV(MUX1);
-  ADMUX = _BV(REFS0) | (input < INPUTS ? input : reference_input); /* full scale is the supply, 5 V */
+  ADCSRB = input < INPUTS && input > 7 ? _BV(MUX5) : 0;                /* A8 to A15 */
+  ADMUX = _BV(REFS0) | (input < INPUTS ? input & 7 : reference_input); /* full scale is the supply, 5 V */
   ADCSRA |= _BV(ADSC); /* clears ADIF as well, because it writes back the 1 */
 }
 
@@ -38,14 +38,20 @@ static void next(struct sensors *sensors) {
   } while (sensors->input < INPUTS && !has_sensor(sensors->input));
 }
 
+static int16_t pressure(uint16_t reading) {
+  const int32_t half = 1L << 11;
+  int32_t value = (reading * SENSOR_SLOPE + SENSOR_OFFSET + half) >> 12;
+  return (int16_t)(value > 32767 ? 32767 : value < -32767 ? -32767 : value); /* NOT_MEASURED is one less */
+}
+
 void sensors_begin(struct sensors *sensors) {
   for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
     sensors->measured[channel] = PROTOCOL_NOT_MEASURED;
   }
   sensors->supply_mv = 0;
   sensors->input = SETTLING;
-  DIDR0 = SENSORS;
-  ADCSRB = 0;
+  DIDR0 = SENSORS & 0xff;
+  DIDR2 = SENSORS >> 8;
   ADCSRA = _BV(ADEN) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0); /* 125 kHz: 104 us a conversion */
   start(sensors->input);
 }
@@ -57,10 +63,9 @@ bool sensors_poll(struct sensors *sensors) {
   }
   reading = ADC;
   if (sensors->input < INPUTS) {
-    const uint32_t half = 1UL << 9;
-    sensors->measured[sensors->input] = (int16_t)((reading * (uint32_t)SENSOR_FULL + half) >> 10);
+    sensors->measured[sensors->input] = pressure(reading);
   } else if (sensors->input == SUPPLY) {
-    sensors->supply_mv = reading < LEAST_READING ? 0 : (uint16_t)(REFERENCE_MV * 1024 / reading);
+    sensors->supply_mv = reading < LEAST_READING ? 0 : (uint16_t)(REFERENCE_MV * 1024UL / reading);
   }
   next(sensors);
   start(sensors->input);

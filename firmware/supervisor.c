@@ -37,6 +37,10 @@ static void send_hello(struct supervisor *s) {
   hello.p_max = P_MAX;
   hello.p_down = P_DOWN;
   hello.p_full = P_FULL;
+  hello.sensor_zero_mv = SENSOR_ZERO_MV;
+  hello.sensor_full_mv = SENSOR_FULL_MV;
+  hello.sensor_full = SENSOR_FULL;
+  hello.supply_least_mv = SUPPLY_LEAST_MV;
   hello.slew = SLEW;
   hello.link_timeout_ms = LINK_TIMEOUT_MS;
   hello.control_timeout_ms = CONTROL_TIMEOUT_MS;
@@ -130,6 +134,10 @@ static void on_arm(struct supervisor *s, const struct frame *frame, uint32_t now
   }
   if ((arm.channels >> CHANNELS_USED) != 0 || arm.p_full != P_FULL) {
     refuse(s, frame, NACK_REASON_RANGE);
+    return;
+  }
+  if (!pressures_down(s)) {
+    refuse(s, frame, NACK_REASON_PRESSURE);
     return;
   }
   s->state = STATE_ARMED;
@@ -285,8 +293,8 @@ static bool lasts(uint16_t *counted_ms, bool condition, uint32_t elapsed_ms, uin
 
 static uint8_t check_sensors(struct supervisor *s, uint32_t elapsed_ms) {
   for (uint8_t channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
-    int16_t measured = s->measured[channel];
-    int16_t difference;
+    int32_t measured = s->measured[channel];
+    int32_t difference;
     bool driven;
     if (measured == PROTOCOL_NOT_MEASURED) {
       continue;
@@ -294,7 +302,10 @@ static uint8_t check_sensors(struct supervisor *s, uint32_t elapsed_ms) {
     if (lasts(&s->over_ms[channel], measured > P_OVER, elapsed_ms, OVER_PRESSURE_MS)) {
       latch(s, FAULT_OVER_PRESSURE); /* in any state */
     }
-    difference = (int16_t)(measured - s->output.applied[channel]); /* both are between 0 and SENSOR_FULL */
+    if (lasts(&s->implausible_ms[channel], measured < SENSOR_LEAST || measured > SENSOR_MOST, elapsed_ms, SENSOR_MS)) {
+      latch(s, FAULT_SENSOR); /* in any state: a broken wire is found before arming */
+    }
+    difference = measured - s->output.applied[channel];
     driven = s->state == STATE_RUNNING && ((s->channels >> channel) & 1);
     if (lasts(&s->above_ms[channel], driven && difference > P_DISAGREE, elapsed_ms, DISAGREE_MS)) {
       latch(s, FAULT_SENSOR);
@@ -304,6 +315,15 @@ static uint8_t check_sensors(struct supervisor *s, uint32_t elapsed_ms) {
     }
   }
   return CHECK_SENSORS;
+}
+
+/* A sagging supply lowers every valve's command in proportion, so a ramp is safe; a supply that is not measured (0) is
+ * too low as well. */
+static uint8_t check_supply(struct supervisor *s, uint32_t elapsed_ms) {
+  if (lasts(&s->supply_low_ms, s->supply_mv < SUPPLY_LEAST_MV, elapsed_ms, SUPPLY_MS)) {
+    latch(s, FAULT_SUPPLY); /* in any state */
+  }
+  return CHECK_SUPPLY;
 }
 
 static uint8_t drive_outputs(struct supervisor *s, uint32_t elapsed_ms) {
@@ -365,6 +385,7 @@ uint8_t supervisor_update(struct supervisor *s, const int16_t measured[PROTOCOL_
   checks = check_link(s, now_ms);
   checks |= check_control(s, now_ms);
   checks |= check_sensors(s, elapsed_ms);
+  checks |= check_supply(s, elapsed_ms);
   checks |= drive_outputs(s, elapsed_ms);
   if (now_ms - s->last_status_ms >= PROTOCOL_STATUS_PERIOD_MS) {
     s->last_status_ms = now_ms;

@@ -24,11 +24,12 @@ enum check {
   CHECK_LINK = 1,
   CHECK_CONTROL = 2,
   CHECK_SENSORS = 4,
-  CHECK_OUTPUTS = 8,
-  CHECK_UPDATE = 15, /* those of supervisor_update */
-  CHECK_ADC = 16,    /* the sketch's: the converter delivers readings */
-  CHECK_PINS = 32,   /* the sketch's: every pin has its counts */
-  CHECK_ALL = 63
+  CHECK_SUPPLY = 8,
+  CHECK_OUTPUTS = 16,
+  CHECK_UPDATE = 31, /* those of supervisor_update */
+  CHECK_ADC = 32,    /* the sketch's: the converter delivers readings */
+  CHECK_PINS = 64,   /* the sketch's: every pin has its counts */
+  CHECK_ALL = 127
 };
 
 struct supervisor {
@@ -54,7 +55,9 @@ struct supervisor {
   int16_t measured[PROTOCOL_CHANNELS];
   uint16_t over_ms[PROTOCOL_CHANNELS];                               /* time above P_OVER */
   uint16_t above_ms[PROTOCOL_CHANNELS], below_ms[PROTOCOL_CHANNELS]; /* time off the applied pressure */
+  uint16_t implausible_ms[PROTOCOL_CHANNELS];                        /* time outside the sensor's range */
   uint16_t supply_mv;
+  uint16_t supply_low_ms; /* time below SUPPLY_LEAST_MV */
 
   struct output_stage output;
   struct frame_parser parser;

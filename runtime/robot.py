@@ -34,6 +34,8 @@ KINDS: dict[str, Kind] = {
     "pneumatic": Kind(("v_x", "v_y"), ("a_0",), ((1.0,), (-1.0,))),
 }
 
+LEAST_SENSOR_SPAN_V = 0.9  # as in firmware/limits.h
+
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)]
 Bar = Annotated[float, Meta(ge=0.0, le=10.0)]
 
@@ -58,6 +60,15 @@ class Valve(Section, frozen=True):
     signal: Literal["0-10 V"]  # output of the board and its amplifiers
     p_min_bar: Bar = 0.08
     p_max_bar: Bar = 0.35
+
+
+class Sensors(Section, frozen=True):
+    """`[sensors]`: the pressure sensors, at the board's analogue inputs: `zero_v` without pressure, `full_v` at
+    `full_scale_bar`, behind a divider where the sensor can exceed 5 V. A board without sensors ignores them."""
+
+    full_scale_bar: Annotated[float, Meta(gt=0.0, le=10.0)]
+    zero_v: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
+    full_v: Annotated[float, Meta(ge=0.0, le=5.0)] = 5.0
 
 
 class Chamber(Section, frozen=True):
@@ -127,6 +138,7 @@ class Robot(Section, frozen=True):
     robot: Identity
     loop: Loop
     valve: Valve | None = None
+    sensors: Sensors = Sensors(full_scale_bar=1.0)
     chambers: tuple[Chamber, ...] = ()
     limits: Limits = Limits()
     tracker: Tracker = Tracker()
@@ -252,6 +264,11 @@ def _check(robot: Robot, where: str) -> None:
             f"valve pressures p_min_bar {valve.p_min_bar}, p_max_bar {valve.p_max_bar}, "
             f"full_scale_bar {valve.full_scale_bar}",
             "p_min_bar < p_max_bar <= full_scale_bar",
+        )
+    if robot.sensors.full_v - robot.sensors.zero_v < LEAST_SENSOR_SPAN_V:
+        refuse(
+            f"[sensors] zero_v {robot.sensors.zero_v}, full_v {robot.sensors.full_v}",
+            f"full_v at least {LEAST_SENSOR_SPAN_V} V above zero_v",
         )
     required: Counter[tuple[int, str]] = Counter((module, side) for module in range(1, count + 1) for side in "+-")
     chambers: Counter[tuple[int, str]] = Counter((chamber.module, chamber.side) for chamber in robot.chambers)

@@ -22,6 +22,7 @@ from modsoft.runtime.board.protocol import (
     UNITS_PER_BAR,
     Fault,
     Hello,
+    Nack,
     NackReason,
     Set,
     State,
@@ -142,7 +143,11 @@ class Board:
         if status is not None and status.faults == Fault.LINK_TIMEOUT:
             raise LostInRun(f"the board at {self.name} received nothing in time and vented by itself; start again")
         if status is not None and status.faults:
-            raise Tripped(f"the board vented by itself: {fault_names(status.faults)}; remove the cause and start again")
+            cause = fault_names(status.faults)
+            if status.faults & Fault.SUPPLY and self._connection.hello is not None:
+                least_v = self._connection.hello.supply_least_mv / 1000
+                cause += f" (supply now {status.supply_mv / 1000:.2f} V, expected at least {least_v:g} V)"
+            raise Tripped(f"the board vented by itself: {cause}; remove the cause and start again")
 
     # ---- requests
 
@@ -157,6 +162,7 @@ class Board:
         self._io_thread.wait(lambda: self._connection.status is not None, deadline)
         if self.status is not None and self.status.faults and not self.status.faults & ~HOST_DISCONNECTED:
             self.clear_fault()
+        nack: Nack | None = None
         while True:
             self._io_thread.wait(lambda: self._connection.can_arm, deadline)
             self.check()
@@ -168,13 +174,23 @@ class Board:
             if status is not None and status.state == State.ARMED and self._connection.armed:
                 self._p_max = self.hello.p_max
                 return
-            nack = self._connection.refused
-            if nack is not None and nack.reason != NackReason.STATE:
+            nack = self._connection.refused or nack  # the last attempt may end without a reply
+            if nack is not None and nack.reason not in (NackReason.STATE, NackReason.PRESSURE):
                 raise ProtocolMismatch(f"board at {self.name} refused to arm: {refusal(nack)}")
             if self._clock() >= deadline:
+                self._check_no_pressure(nack)
                 state = State(status.state).name if status is not None and status.state in set(State) else "unknown"
                 raise Tripped(f"board at {self.name} did not arm within {ARM_WAIT_S:.0f} s, its state is {state}")
             self._io_thread.wait(lambda: False, self._clock() + ARM_RETRY_S)
+
+    def _check_no_pressure(self, nack: Nack | None) -> None:
+        """Raise `Tripped` if the board refused to arm because of a measured pressure."""
+        if nack is not None and nack.reason == NackReason.PRESSURE:
+            pressures = ", ".join(f"channel {c}: {bar:.3f}" for c, bar in self._pressures_left().items())
+            raise Tripped(
+                f"board at {self.name} did not arm: the sensors measure {pressures} bar, expected less than "
+                f"{to_bar(self.hello.p_down):g}; vent these chambers, or correct the sensors' zero, then start again"
+            )
 
     def set_pressures(self, tick: int, pressures_bar: ArrayLike) -> int:
         """Send the set-points (channels,), bar, of this tick; returns after 2 ms at most, with the sequence number.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from modsoft.runtime.board.protocol import Hello, to_bar, to_units
 from modsoft.runtime.errors import ProtocolMismatch, RobotFileError
-from modsoft.runtime.robot import Robot
+from modsoft.runtime.robot import Robot, Sensors
 
 LONGEST_STEP = 1.5  # periods, largest time between two commands of a loop that misses none
 
@@ -12,8 +12,8 @@ LONGEST_STEP = 1.5  # periods, largest time between two commands of a loop that 
 def check_board(hello: Hello, robot: Robot, name: str) -> int:
     """Return the mask of the valve channels that the robot uses; bit c is channel c.
 
-    name: port of the board, for messages. Raises `ProtocolMismatch` if valve full scale, pressure range, slew, control
-    time-out or channels of board and robot file differ, `RobotFileError` for a robot without valves.
+    name: port of the board, for messages. Raises `ProtocolMismatch` if valve full scale, pressure range, sensors, slew,
+    control time-out or channels of board and robot file differ, `RobotFileError` for a robot without valves.
     """
     valve = robot.valve
     if valve is None:
@@ -29,6 +29,7 @@ def check_board(hello: Hello, robot: Robot, name: str) -> int:
                 f"{what}: the board at {name} has {to_bar(board_units):g} bar, the robot file {robot_bar:g}; "
                 f"correct {constant} in firmware/limits.h and flash it, or {key} in the robot file"
             )
+    _check_sensors(hello, robot.sensors, name)
     if hello.slew > to_units(robot.limits.slew_bar_per_s):
         raise ProtocolMismatch(
             f"slew: the board at {name} has {to_bar(hello.slew):g} bar/s, the robot file allows "
@@ -49,3 +50,17 @@ def check_board(hello: Hello, robot: Robot, name: str) -> int:
                 "CHANNELS_USED in firmware/pins.h"
             )
     return sum(1 << chamber.channel for chamber in robot.chambers)
+
+
+def _check_sensors(hello: Hello, sensors: Sensors, name: str) -> None:
+    board = (hello.sensor_zero_mv, hello.sensor_full_mv, hello.sensor_full)
+    expected = (round(1000 * sensors.zero_v), round(1000 * sensors.full_v), to_units(sensors.full_scale_bar))
+    if hello.sensors and board != expected:
+        found, wanted = (
+            f"{zero / 1000:g} to {full / 1000:g} V for 0 to {to_bar(units):g} bar"
+            for zero, full, units in (board, expected)
+        )
+        raise ProtocolMismatch(
+            f"pressure sensors: the board at {name} has {found}, the robot file {wanted}; correct SENSOR_ZERO_MV, "
+            "SENSOR_FULL_MV and SENSOR_FULL in firmware/limits.h and flash it, or [sensors] in the robot file"
+        )

@@ -48,7 +48,8 @@ class Fault(IntFlag):
     CONTROL_TIMEOUT = 0x0002  # frames arrived, but the tick of the control loop did not advance
     OVER_PRESSURE = 0x0004  # a sensor measured more than the limit for too long
     LEAK = 0x0008  # a chamber remained below its set-point
-    SENSOR = 0x0010  # a chamber remained above its set-point: sensor or valve stuck
+    SENSOR = 0x0010  # a chamber remained above its set-point, or a sensor is outside its range: sensor or valve broken
+    SUPPLY = 0x0020  # the supply of the board was too low for too long
 
 
 class VentMode(IntEnum):
@@ -68,6 +69,7 @@ class NackReason(IntEnum):
     SEQUENCE = 5
     HASH = 6
     TYPE = 7
+    PRESSURE = 8  # ARM while a sensor measures p_down or more
 
 
 class ResetCause(IntEnum):
@@ -114,6 +116,10 @@ class Hello(NamedTuple):
     p_max: I16
     p_down: I16  # a channel that measures this or more is under pressure
     p_full: U32
+    sensor_zero_mv: U16  # output of the pressure sensors without pressure
+    sensor_full_mv: U16  # output at the pressure sensor_full
+    sensor_full: U32
+    supply_least_mv: U16  # a lower supply is a fault
     slew: U16
     link_timeout_ms: U16
     control_timeout_ms: U16

@@ -27,6 +27,7 @@ class NativeBoard:
             library.board_new(boot_id, int(protocol.ResetCause.POWER_ON), ctypes.c_uint32(start_ms))
         )
         self.measured = [0] * 6 + [protocol.NOT_MEASURED] * 6
+        self.supply_mv = 5000
         self.parser = codec.Parser()
         self.session = 0
         self.seq = 0
@@ -47,7 +48,7 @@ class NativeBoard:
 
     def update(self) -> int:
         measured = (ctypes.c_int16 * protocol.CHANNELS)(*self.measured)
-        return self.library.supervisor_update(self.handle, measured, 5000, ctypes.c_uint32(self.now_ms))
+        return self.library.supervisor_update(self.handle, measured, self.supply_mv, ctypes.c_uint32(self.now_ms))
 
     def wait(self, milliseconds: int) -> None:
         for _ in range(milliseconds):

@@ -264,6 +264,13 @@ def test_noise_instead_of_frames(new_board):
         ("full_scale_bar = 3.0", "full_scale_bar = 10.0", "valve full scale: .* has 3 bar, the robot file 10"),
         ("p_min_bar = 0.08", "p_min_bar = 0.1", "smallest pressure"),
         ("p_max_bar = 0.35", "p_max_bar = 0.3", "largest pressure"),
+        (
+            "zero_v = 0.0",
+            "zero_v = 0.5",
+            "has 0 to 5 V for 0 to 1 bar, the robot file 0.5 to 5 V for 0 to 1 bar; correct",
+        ),
+        ("full_v = 5.0", "full_v = 4.5", "pressure sensors: .* the robot file 0 to 4.5 V for 0 to 1 bar"),
+        ("full_scale_bar = 1.0", "full_scale_bar = 2.0", "pressure sensors: .* the robot file 0 to 5 V for 0 to 2 bar"),
         ("slew_bar_per_s = 2.0", "slew_bar_per_s = 1.0", "has 2 bar/s, the robot file allows 1"),
         ("hz = 2.5", "hz = 1.5", "has 1 s, expected more than 1 s at 1.5 Hz"),
         ("channel = 5", "channel = 11", "channel 11, the board at virtual has channels 0 to 10"),
@@ -275,6 +282,34 @@ def test_board_that_does_not_fit_the_robot_file_is_never_armed(rig, old, new, co
         board.arm(changed(old, new))
     assert port.count(protocol.Arm) == 0
     assert port.board.state == State.IDLE
+
+
+def test_sensors_of_the_robot_file_do_not_matter_to_a_board_without_sensors(rig):
+    board, port = rig
+    board._connection.hello = board.hello._replace(sensors=0)
+    board.arm(changed("zero_v = 0.0", "zero_v = 0.5"))
+    assert port.board.state == State.ARMED
+
+
+def test_board_under_pressure_is_armed_when_the_pressure_is_down(rig):
+    board, port = rig
+    port.follows = False
+    port.board.measured[:3] = [600, 499, 2100]
+    with pytest.raises(Tripped, match=r"channel 0: 0.060, channel 2: 0.210 bar, expected less than 0.05; vent these"):
+        board.arm(ROBOT)
+    assert port.board.state == State.IDLE
+    port.follows = True
+    board.arm(ROBOT)
+    assert port.board.state == State.ARMED
+
+
+def test_low_supply_is_reported_with_its_limit(rig):
+    board, port = rig
+    board.arm(ROBOT)
+    port.board.supply_mv = 4312
+    with pytest.raises(Tripped, match=r"SUPPLY \(supply now 4.31 V, expected at least 4.5 V\); remove the cause"):
+        run(board, port, 2)
+    assert port.board.faults == Fault.SUPPLY
 
 
 def test_cable_robot_has_nothing_to_arm(rig):

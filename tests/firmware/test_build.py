@@ -58,7 +58,11 @@ def test_logic_includes_no_hardware(name):
     [
         (("#define P_MIN 800", "#define P_MIN 3500"), "limits out of order"),
         (("#define SLEW 20000U", "#define SLEW 10000U"), "SLEW is too slow to vent in time"),
-        (("#define SENSOR_FULL 10000L", "#define SENSOR_FULL 4000L"), "cannot see an over-pressure"),
+        (("#define SENSOR_FULL 10000\n", "#define SENSOR_FULL 4000\n"), "cannot see an over-pressure"),
+        (("#define SENSOR_FULL 10000\n", "#define SENSOR_FULL 200000\n"), "cannot see an over-pressure"),
+        (("#define SENSOR_ZERO_MV 0", "#define SENSOR_ZERO_MV 4200"), "range of a sensor"),
+        (("#define SENSOR_FULL_MV 5000", "#define SENSOR_FULL_MV 10000"), "range of a sensor"),
+        (("#define REFERENCE_MV 1100", "#define REFERENCE_MV 11000"), "reference is 1.0 to 1.2 V"),
         (("#define LINK_TIMEOUT_MS 300", "#define LINK_TIMEOUT_MS 150"), "one late heartbeat"),
     ],
 )

@@ -35,9 +35,11 @@ def test_hello_is_sent_once_at_boot_before_all_else(board):
     assert rest == []
     assert first.protocol_hash == protocol.PROTOCOL_HASH
     assert (first.boot_id, first.reset_cause) == (0xB0A4D, protocol.ResetCause.POWER_ON)
-    assert (first.firmware_version, first.channels, first.sensors) == (1, 11, 0x3F)
+    assert (first.firmware_version, first.channels, first.sensors) == (2, 11, 0x3F)
     assert (first.p_min, first.p_max, first.p_down) == (800, 3500, 500)
     assert (first.p_full, first.slew) == (30000, 20000)
+    assert (first.sensor_zero_mv, first.sensor_full_mv, first.sensor_full) == (0, 5000, 10000)
+    assert first.supply_least_mv == 4500
     assert (first.link_timeout_ms, first.control_timeout_ms) == (300, 1000)
     assert board.state == State.BOOT
     answers = []
@@ -115,7 +117,7 @@ def test_frames_are_numbered(board):
 
 def test_every_pass_reports_every_check(running):
     running.wait(1)
-    assert running.update() == 15
+    assert running.update() == 31
 
 
 # ---- arming
@@ -209,6 +211,7 @@ def test_arm_for_another_session_while_armed_refused(board, session, expected):
 def test_arm_refused_while_running_and_old_arm_afterwards(running):
     assert reason(running.arm()) == NackReason.STATE
     running.send(Vent(VentMode.DUMP))
+    running.follow()
     running.heartbeats(1100)
     assert reason(running.arm(new_session=1)) == NackReason.SESSION
     running.arm()
@@ -575,24 +578,17 @@ def test_no_set_point_opens_a_valve_while_idle(board):
         assert board.counts == [0] * 12
 
 
-def test_queue_for_the_host_holds_255_bytes(board):
-    board.feed(codec.encode(HelloReq(protocol.PROTOCOL_HASH)) * 3)
-    board.feed(codec.encode(Vent(VentMode.RAMP)))
-    board.feed(b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0")
-    raw = board.drain()
-    kinds = [type(frame.message) for frame in codec.Parser().feed(raw)]
-    assert kinds == [Hello] * 4 + [Status, protocol.Nack]
-    assert len(raw) == 255
-
-
-def test_queue_for_the_host_does_not_hold_256_bytes(board):
+@pytest.mark.parametrize(("taken", "refusals"), [(11, 4), (10, 3)])
+def test_queue_for_the_host_holds_255_bytes(board, taken, refusals):
     """A full ring buffer would look like an empty one: 256 bytes must not be queued."""
+    first = b"".join(bytes([board.library.supervisor_next_byte(board.handle)]) for _ in range(taken))
     board.feed(codec.encode(Vent(VentMode.RAMP)) * 2)
     board.feed((b"\0" + with_crc(bytes((0x7F, 9, 0))) + b"\0") * 4)
-    raw = board.drain()
+    raw = first + board.drain()
     kinds = [type(frame.message) for frame in codec.Parser().feed(raw)]
-    assert kinds == [Hello, Status, Status] + [protocol.Nack] * 3
-    assert len(raw) + len(raw) - raw.rindex(b"\0\0") - 1 == 256  # with the last refusal
+    assert kinds == [Hello, Status, Status] + [protocol.Nack] * refusals
+    nack_size = len(raw) - raw.rindex(b"\0\0") - 1
+    assert len(raw) - taken + (4 - refusals) * nack_size == 266 - taken  # with the last refusal
 
 
 def test_board_never_waits_for_a_host_that_does_not_read(board):
@@ -642,3 +638,76 @@ def test_only_a_channel_of_this_robot_can_disagree(board, channel, fault):
         board.follow()
         board.measured[channel] += 1500
     assert board.faults == fault
+
+
+@pytest.mark.parametrize(("units", "expected"), [(499, State.ARMED), (500, State.IDLE)])
+@pytest.mark.parametrize("channel", [0, 5])
+def test_arm_refused_while_a_sensor_measures_pressure(board, channel, units, expected):
+    board.heartbeats(1100)
+    board.measured[channel] = units
+    board.update()
+    answers = board.arm()
+    assert board.state == expected
+    if expected == State.IDLE:
+        assert reason(answers) == NackReason.PRESSURE
+
+
+@pytest.mark.parametrize(("units", "faulty"), [(-1, True), (0, False), (-2500, True)])
+def test_sensor_below_its_range_is_a_fault_in_any_state(board, units, faulty):
+    """With 0 to 5 V sensors a negative pressure cannot be read; with 0.5 to 4.5 V it is a broken wire."""
+    board.heartbeats(1100)
+    board.measured[4] = units
+    board.wait(99)
+    assert board.faults == Fault(0)
+    board.wait(1)
+    assert board.faults == (Fault.SENSOR if faulty else Fault(0))
+
+
+def test_sensor_above_its_range_is_a_sensor_fault_as_well(board):
+    board.measured[4] = 10000
+    board.wait(101)
+    assert board.faults == Fault.OVER_PRESSURE
+    board.measured[4] = 10001
+    board.wait(100)
+    assert board.faults == Fault.OVER_PRESSURE | Fault.SENSOR
+
+
+def test_broken_wire_ramps_the_pressures_down(running):
+    running.measured[0] = -1
+    running.wait(100)
+    assert running.faults == Fault.SENSOR
+    assert any(running.applied), "a dump"
+    running.measured[0] = 0
+    assert until_vented(running) <= 200
+
+
+def test_brief_sensor_glitches_are_no_fault(running):
+    for _ in range(20):
+        running.measured[0] = -1
+        running.wait(50)
+        running.measured[0] = running.applied[0]
+        running.heartbeats(100)
+    assert running.faults == Fault(0)
+
+
+@pytest.mark.parametrize("supply_mv", [4499, 0])
+def test_low_supply_ramps_the_pressures_down(running, supply_mv):
+    running.supply_mv = supply_mv
+    running.wait(99)
+    assert running.state == State.RUNNING
+    running.wait(1)
+    assert (running.state, running.faults) == (State.FAULT, Fault.SUPPLY)
+    assert any(running.applied), "a dump"
+    assert until_vented(running) <= 200
+
+
+def test_lowest_allowed_supply_is_no_fault(running):
+    running.supply_mv = 4500
+    running.heartbeats(1000)
+    running.supply_mv = 4499
+    running.wait(99)
+    running.supply_mv = 4500
+    running.wait(1)
+    running.supply_mv = 4499
+    running.wait(99)
+    assert running.faults == Fault(0)

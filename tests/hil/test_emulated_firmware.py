@@ -107,7 +107,7 @@ def resets_with(folder: Path, name: str, old: str, new: str) -> list[str]:
 
 
 def test_every_check_is_found_and_together_they_feed_the_watchdog(firmware_copy: Path) -> None:
-    assert len(CHECKS) == 7
+    assert len(CHECKS) == 8
     assert resets_with(firmware_copy, "supervisor.c", "", "") == ["power-on"]
 
 

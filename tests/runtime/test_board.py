@@ -14,7 +14,7 @@ from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.protocol import CHANNELS, PROTOCOL_HASH, Hello, State, Status
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, PortBusy, Tripped, UsageError
 
-HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 500, 30000, 20000, 300, 1000)
+HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 500, 30000, 0, 5000, 10000, 4500, 20000, 300, 1000)
 STATUS = Status(0, State.IDLE, 0, 7, 1, 0, (0,) * CHANNELS, (0,) * CHANNELS, 0, 0, 0, 5000)
 
 

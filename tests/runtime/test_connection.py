@@ -8,7 +8,7 @@ from modsoft.runtime.board.codec import encode
 from modsoft.runtime.board.connection import HEARTBEAT_S, Connection, Phase
 from modsoft.runtime.board.protocol import CHANNELS, PROTOCOL_HASH, Hello, HelloReq, Set, State, Status
 
-HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 500, 30000, 20000, 300, 1000)
+HELLO = Hello(PROTOCOL_HASH, 1, 7, 1, 11, 0, 800, 3500, 500, 30000, 0, 5000, 10000, 4500, 20000, 300, 1000)
 ZERO = (0,) * CHANNELS
 IDLE = Status(0, State.IDLE, 0, 7, 1, 0, ZERO, ZERO, 0, 0, 0, 5000)
 

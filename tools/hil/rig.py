@@ -36,7 +36,7 @@ Line = dict[str, Any]
 START_TIMEOUT_S = 60.0  # the first start compiles the simulator
 RUNTIME_STOP_TIMEOUT_S = 5.0  # it vents and waits for the board's confirmation
 FORWARD_PERIOD_S = 0.004  # a slewing board changes its duties every millisecond; the plant needs them every 20
-SENSED_CHANNELS = 8  # A0 to A7
+SENSED_CHANNELS = 16  # A0 to A15
 
 
 class Child:

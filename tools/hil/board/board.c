@@ -8,7 +8,8 @@
  * that a busy machine does not disturb a host on that clock.
  *
  * Commands, one a line on standard input; end of file ends the board:
- *   adc INPUT MILLIVOLT                       voltage on A0..A7
+ *   adc INPUT MILLIVOLT                       voltage on A0..A15
+ *   supply MILLIVOLT                          supply of the chip, 5000 at first: scale of the converter
  *   sensors TAU_MS                            pressure sensors follow their valves with a first-order lag until `adc`
  *   reset | power-cycle                       reset pin; power off and on (RAM lost)
  *   hang [cli]                                the main loop stops until a reset; cli: interrupts are off too
@@ -23,8 +24,9 @@
  * Events, one JSON object a line on standard output, each with t_us (emulated, from the cycle counter), mono_ns
  * (CLOCK_MONOTONIC when it was emulated) and event:
  *   ready      board, clock, port, channels, bootloader, pid; p_full_bar (valve pressure at duty 1), sensors (bit c:
- *              channel c has a sensor, on input c), sensor_mv_per_bar
- *   pwm        channel (order of firmware/pins.h), duty 0..1, raw [compare, top]; only when one of them changes
+ *              channel c has a sensor, on input c), sensor_mv_per_bar, sensor_zero_mv
+ *   pwm        channel (order of firmware/pins.h), duty 0..1, raw [compare, top], floating (the pin is
+ *              an input: neither high nor low); only when one of them changes
  *   uart-open, uart-close, dtr-pulse, wrong-baud
  *   watchdog, reset (cause: power-on, external, watchdog), hang, halted
  *   late       emulated time gave way by late_us
@@ -35,7 +37,7 @@
  *              firmware_max_awake_us: its longest time without sleep (its slowest loop)
  *
  * Known differences from the chip: a new compare value takes effect at once, not at the end of the PWM period (256 us);
- * a pin whose timer is connected but stopped counts as 0; ADC8..15 do not exist; waking from sleep takes no time.
+ * a pin whose timer is connected but stopped counts as 0; waking from sleep takes no time.
  *
  * simavr is GPL-3: this file is a test tool and not part of the wheel. */
 #include "mega.h"
@@ -62,6 +64,7 @@ static const char *reset_cause;
 static ticks_t held_until; /* end of the reset; 0: running */
 static bool chip_was_reset, halted_reported;
 static void (*chip_reset)(avr_t *);
+static unsigned adc_mv[ADC_CHANNELS];
 static ticks_t woken; /* end of the last sleep; 0 before the first */
 static struct {
   uint32_t at;
@@ -180,8 +183,27 @@ void board_run(ticks_t until) {
 
 ticks_t board_now(void) { return avr ? avr->cycle : 0; }
 
-void board_set_adc(unsigned input, unsigned millivolt) {
-  avr_raise_irq(avr_io_getirq(avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_ADC0 + input), millivolt);
+void board_set_adc(unsigned input, unsigned millivolt) { adc_mv[input] = millivolt; }
+
+void board_set_supply(unsigned millivolt) { avr->vcc = avr->avcc = avr->aref = millivolt; }
+
+/* simavr has eight analogue inputs. At the start of a conversion the selected one gets its voltage. */
+static void on_conversion(avr_irq_t *irq, uint32_t value, void *param) {
+  unsigned input = (avr->data[ADMUX] & 7) | (avr->data[ADCSRB] & 1 << MUX5 ? 8 : 0);
+  (void)irq, (void)value, (void)param;
+  if (!(avr->data[ADMUX] & 0x18)) {
+    avr_raise_irq(avr_io_getirq(avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_ADC0 + (input & 7)), adc_mv[input]);
+  }
+}
+
+static void adc_begin(void) {
+  for (avr_io_t *io = avr->io_port; io; io = io->next) {
+    for (unsigned input = 0; !strcmp(io->kind, "adc") && input < 8; input++) {
+      avr_adc_t *adc = (avr_adc_t *)io;
+      adc->muxmode[32 + input] = adc->muxmode[input]; /* with MUX5: A8..A15 */
+    }
+  }
+  avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_OUT_TRIGGER), on_conversion, NULL);
 }
 
 /* --- start ------------------------------------------------------------------------------------------------------- */
@@ -247,6 +269,7 @@ void board_power_on(const struct options *options) {
     avr->reset_pc = load_hex(options->bootloader);
   }
 
+  adc_begin();
   uart_begin();
   outputs_begin();
   board_power_cycle();

@@ -26,6 +26,7 @@ static unsigned output_of[MAX_CHANNELS];
 static struct {
   double duty;
   unsigned compare, top;
+  bool floating;
 } last[MAX_CHANNELS];
 static struct {
   avr_io_write_t write;
@@ -50,13 +51,15 @@ static void sample(unsigned channel) {
   if (duty == 0) {
     compare = top = 0; /* the registers of a disconnected timer have no effect */
   }
-  if (duty == last[channel].duty && compare == last[channel].compare && top == last[channel].top) {
+  if (duty == last[channel].duty && compare == last[channel].compare && top == last[channel].top &&
+      is_output != last[channel].floating) {
     return;
   }
   last[channel].duty = duty;
   last[channel].compare = compare;
   last[channel].top = top;
-  harness_report_duty(channel, duty, compare, top);
+  last[channel].floating = !is_output;
+  harness_report_duty(channel, !is_output, duty, compare, top);
 }
 
 void outputs_sample(void) {

@@ -163,7 +163,7 @@ class EmulatedBoard:
 
     def millivolt(self, pressure_bar: float) -> int:
         """Voltage of a sensor on this board at a pressure, for the command `adc`."""
-        return round(pressure_bar * float(self.ready["sensor_mv_per_bar"]))
+        return round(self.ready["sensor_zero_mv"] + pressure_bar * self.ready["sensor_mv_per_bar"])
 
     def wait_for(self, predicate: Callable[[Event], bool], timeout_s: float, since: int = 0) -> Event:
         """Return the first event in `trace[since:]` that the predicate accepts; `TimeoutError` if none comes.

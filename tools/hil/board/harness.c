@@ -36,10 +36,11 @@ uint32_t harness_random(void) {
   return random_state >> 32;
 }
 
-void harness_report_duty(unsigned channel, double duty, unsigned compare, unsigned top) {
+void harness_report_duty(unsigned channel, bool floating, double duty, unsigned compare, unsigned top) {
   sensors_on_duty(channel, duty);
   pwm_events++;
-  events_emit("pwm", "\"channel\":%u,\"duty\":%.6f,\"raw\":[%u,%u]", channel, duty, compare, top);
+  events_emit("pwm", "\"channel\":%u,\"duty\":%.6f,\"raw\":[%u,%u],\"floating\":%s", channel, duty, compare, top,
+              floating ? "true" : "false");
 }
 
 void harness_report_reset(const char *cause) {
@@ -83,9 +84,11 @@ static bool run_command(char *line) {
   int numbers = sscanf(line, "%*s %lf %lf", &a, &b);
   if (!strcmp(verb, "quit")) {
     stop_signal = SIGTERM;
-  } else if (!strcmp(verb, "adc") && numbers == 2 && a >= 0 && a < ADC_CHANNELS && b >= 0 && b <= SENSOR_FULL_MV) {
+  } else if (!strcmp(verb, "adc") && numbers == 2 && a >= 0 && a < ADC_CHANNELS && b >= 0 && b <= ADC_FULL_MV) {
     sensors_hold((unsigned)a, (unsigned)b);
     return true; /* a rig sends hundreds a second: no event */
+  } else if (!strcmp(verb, "supply") && numbers == 1 && a >= 2700 && a <= 5500) {
+    board_set_supply((unsigned)a);
   } else if (!strcmp(verb, "sensors") && numbers == 1 && a > 0) {
     sensors_follow(a);
   } else if (!strcmp(verb, "reset")) {
@@ -230,13 +233,14 @@ static struct options parse_options(int argc, char **argv) {
 static void report_ready(const struct options *options) {
   events_emit("ready",
               "\"board\":\"%s\",\"clock\":\"%s\",\"port\":\"%s\",\"channels\":%u,\"bootloader\":%s,\"pid\":%d,"
-              "\"p_full_bar\":%g,\"sensors\":%u,\"sensor_mv_per_bar\":%g",
+              "\"p_full_bar\":%g,\"sensors\":%u,\"sensor_mv_per_bar\":%g,\"sensor_zero_mv\":%d",
               board_name,
               options->stepped ? "emulated, step by step"
               : options->fast  ? "emulated, not held to real time"
                                : "emulated, held to real time",
               pty_port(), board_channels, options->bootloader ? "true" : "false", (int)getpid(),
-              (double)P_FULL / UNITS_PER_BAR, (unsigned)SENSORS, SENSOR_MV_PER_UNIT * UNITS_PER_BAR);
+              (double)P_FULL / UNITS_PER_BAR, (unsigned)SENSORS, SENSOR_MV_PER_UNIT * UNITS_PER_BAR,
+              (int)SENSOR_ZERO_MV);
 }
 
 /* Runs the board for one slice of emulated time. */

@@ -18,7 +18,8 @@ typedef uint64_t ticks_t;
 /* The MEGA's fuses hold the chip for 16K clocks and 65 ms after every reset. */
 #define STARTUP_TICKS (16384 + 65000 * TICKS_PER_US)
 
-#define ADC_CHANNELS 8
+#define ADC_CHANNELS 16
+#define ADC_FULL_MV 5000
 #define MAX_CHANNELS 16
 
 struct options {
@@ -48,6 +49,7 @@ void board_power_cycle(void);         /* a reset that also loses the RAM */
 bool board_runs_firmware(void);       /* false: in reset, or in the bootloader */
 bool board_hang(bool interrupts_off); /* stops the main loop until the next reset; false: not possible now */
 void board_set_adc(unsigned input, unsigned millivolt);
+void board_set_supply(unsigned millivolt);
 
 /* --- the serial port (pty.c) ------------------------------------------------------------------------------------- */
 
@@ -78,8 +80,7 @@ void pty_flood(ticks_t duration);
 
 /* --- pressure sensors (sensors.c) -------------------------------------------------------------------------------- */
 
-#define SENSOR_FULL_MV 5000
-#define SENSOR_MV_PER_UNIT ((double)SENSOR_FULL_MV / SENSOR_FULL) /* a unit is that of limits.h, 10 Pa */
+#define SENSOR_MV_PER_UNIT ((double)SENSOR_SPAN_MV / SENSOR_FULL) /* a unit is that of limits.h, 10 Pa */
 #define UNITS_PER_BAR (100000 / PROTOCOL_PRESSURE_UNIT_PA)
 
 void sensors_follow(double tau_ms);                    /* every sensor follows its valve */
@@ -97,7 +98,7 @@ _Noreturn void events_fail(int exit_code, const char *format, ...) __attribute__
 
 /* --- outputs and random numbers (harness.c) ---------------------------------------------------------------------- */
 
-void harness_report_duty(unsigned channel, double duty, unsigned compare, unsigned top);
+void harness_report_duty(unsigned channel, bool floating, double duty, unsigned compare, unsigned top);
 void harness_report_reset(const char *cause);
 uint32_t harness_random(void);
 

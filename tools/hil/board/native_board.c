@@ -15,7 +15,6 @@
 #define WATCHDOG_TICKS (128 * 1000 * TICKS_PER_US) /* WDTO_120MS is 16384 cycles of 128 kHz */
 #define TX_BUFFER 64
 #define ADC_COUNTS 1024
-#define ADC_FULL_MV 5000
 
 const char *const board_name = "native";
 const unsigned board_channels = CHANNELS_USED;
@@ -27,7 +26,9 @@ static uint32_t boot_id;
 static int rx_now = -1;
 static bool hung;
 static unsigned counts_now[MAX_CHANNELS];
+static bool floating[MAX_CHANNELS];
 static int16_t measured[PROTOCOL_CHANNELS];
+static unsigned supply_mv = ADC_FULL_MV;
 
 static uint32_t now_ms(void) { return (uint32_t)((now - started) / LOOP_TICKS); }
 
@@ -38,21 +39,22 @@ static void start(uint8_t cause, const char *name) {
   harness_report_reset(name);
   supervisor_init(&logic, boot_id, cause, 0);
   for (unsigned channel = 0; channel < board_channels; channel++) {
-    if (counts_now[channel]) {
-      harness_report_duty(channel, counts_now[channel] = 0, 0, 0);
+    if (!floating[channel]) {
+      harness_report_duty(channel, floating[channel] = true, counts_now[channel] = 0, 0, 0);
     }
   }
 }
 
 static void loop(void) {
-  uint8_t checks = supervisor_update(&logic, measured, ADC_FULL_MV, now_ms());
+  uint8_t checks = supervisor_update(&logic, measured, (uint16_t)supply_mv, now_ms());
   for (unsigned channel = 0; channel < board_channels; channel++) {
     unsigned counts = supervisor_counts(&logic, channel);
-    if (counts == counts_now[channel]) {
+    if (counts == counts_now[channel] && !floating[channel]) {
       continue;
     }
     counts_now[channel] = counts;
-    harness_report_duty(channel, (double)counts / PWM_COUNTS, counts ? counts - 1 : 0, counts ? PWM_TOP : 0);
+    floating[channel] = false;
+    harness_report_duty(channel, false, (double)counts / PWM_COUNTS, counts ? counts - 1 : 0, counts ? PWM_TOP : 0);
   }
   ticks_t byte_ticks = (ticks_t)TICKS_PER_SECOND * 10 / BAUD;
   while (tx_free < now + TX_BUFFER * byte_ticks) {
@@ -117,7 +119,7 @@ void board_power_on(const struct options *options) {
     events_fail(EXIT_USAGE, "the native board has no bootloader: leave --bootloader out");
   }
   for (unsigned channel = 0; channel < PROTOCOL_CHANNELS; channel++) {
-    measured[channel] = channel < ADC_CHANNELS && (SENSORS >> channel & 1) ? 0 : PROTOCOL_NOT_MEASURED;
+    measured[channel] = SENSORS >> channel & 1 ? 0 : PROTOCOL_NOT_MEASURED;
   }
   board_power_cycle();
 }
@@ -135,6 +137,9 @@ ticks_t board_now(void) { return now; }
 
 void board_set_adc(unsigned input, unsigned millivolt) {
   if (SENSORS >> input & 1) {
-    measured[input] = (int16_t)(millivolt * (ADC_COUNTS - 1) / ADC_FULL_MV * (uint32_t)SENSOR_FULL / ADC_COUNTS);
+    unsigned reading = millivolt * (ADC_COUNTS - 1) / ADC_FULL_MV;
+    measured[input] = (int16_t)SENSOR_PRESSURE(reading * ADC_FULL_MV / ADC_COUNTS);
   }
 }
+
+void board_set_supply(unsigned millivolt) { supply_mv = millivolt; }

@@ -34,9 +34,9 @@ void sensors_advance(double elapsed_us) {
     if (!sensor[input].follows) {
       continue;
     }
-    double target_mv = duty_now[input] * P_FULL * SENSOR_MV_PER_UNIT;
+    double target_mv = SENSOR_ZERO_MV + duty_now[input] * P_FULL * SENSOR_MV_PER_UNIT;
     sensor[input].level_mv += (target_mv - sensor[input].level_mv) * -expm1(-elapsed_us / tau_us);
-    unsigned level_mv = (unsigned)fmin(sensor[input].level_mv + 0.5, SENSOR_FULL_MV);
+    unsigned level_mv = (unsigned)fmin(sensor[input].level_mv + 0.5, ADC_FULL_MV);
     if (level_mv != sensor[input].sent_mv) {
       board_set_adc(input, sensor[input].sent_mv = level_mv);
     }
