@@ -10,7 +10,7 @@ from modsoft.runtime.errors import InUse, OutputError, UsageError
 class Interrupted:
     """A rig that is interrupted by Ctrl-C after it has written its files."""
 
-    def __init__(self, robot_file, folder, board):
+    def __init__(self, robot_file, folder, board, pull_downs):
         self.folder, self.runs = folder, folder / "runtime-log-1"
 
     def __enter__(self):

@@ -113,10 +113,10 @@ def test_fast_board_is_faster_than_real_time() -> None:
 @pytest.mark.usefixtures("simavr")
 def test_invalid_command_is_refused() -> None:
     with EmulatedBoard("simavr") as board:
-        for command in ("adc 8 100", "adc 0 6000", "drop-rx 2", "hum", "hang"):  # hang: still in the bootloader
+        for command in ("adc 16 100", "adc 0 6000", "drop-rx 2", "hum", "hang"):  # hang: still in the bootloader
             board.send(command)
         board.send("adc 0 100")
         board.send("quit")
         board.wait_for(is_event("summary"), 5)
     refused = [event["line"] for event in board.trace if event["event"] == "command" and not event["done"]]
-    assert refused == ["adc 8 100", "adc 0 6000", "drop-rx 2", "hum", "hang"]
+    assert refused == ["adc 16 100", "adc 0 6000", "drop-rx 2", "hum", "hang"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from output_rises import rises
 
-from modsoft.hil.outputs import emulated_us, read_outputs
+from modsoft.hil.outputs import command_down_after_ms, emulated_us, read_outputs
 
 TOP = 4095
 READY = {"event": "ready", "channels": 3, "t_us": 0.0, "mono_ns": 0}
@@ -70,3 +70,16 @@ def test_rises_are_counted_against_the_duty_before():
     events = [pwm(1, 0, 0.1), pwm(2, 1, 0.2), {"event": "command"}]
     assert rises(events) == 2
     assert rises([*events, pwm(4, 0, 0.05), pwm(5, 0, 0.1), pwm(6, 1, 0.2)], 3) == 1
+
+
+def test_command_of_a_floating_pin_falls_only_with_a_pull_down():
+    """0.35 bar of 3 bar; the pin floats from 10 ms to 2 s, when the firmware drives it low."""
+    full = 0.35 / 3.0
+    events = [READY, pwm(1, 0, full), pwm(10, 0, 0.0) | {"floating": True}, pwm(2000, 0, 0.0)]
+    outputs = read_outputs(events)
+    expected_ms = 110.0 * math.log(0.35 / 0.05)
+    assert command_down_after_ms(outputs, 10e3, 3e6, pull_downs=True) == pytest.approx(expected_ms, abs=1.5)
+    assert command_down_after_ms(outputs, 10e3, 3e6, pull_downs=False) == pytest.approx(1990.0, abs=1.5)
+    assert command_down_after_ms(outputs, 10e3, 1e6, pull_downs=False) == math.inf
+    assert command_down_after_ms(read_outputs(events[:2]), 10e3, 1e6, pull_downs=True) == math.inf
+    assert command_down_after_ms(read_outputs([READY]), 0.0, 1e4, pull_downs=False) == 0.0

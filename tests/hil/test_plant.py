@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from modsoft.hil.plant import ValvesAndArm, duties_from, run, set_points_bar, tool_poses
+from modsoft.hil.plant import FilteredPins, ValvesAndArm, duties_from, run, set_points_bar, tool_poses
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.actuation import channel_pressures_bar, pressures_bar
 from modsoft.runtime.control.features import from_directors, from_poses
@@ -135,3 +135,34 @@ def test_every_line_is_json(robot):
     stepped = ValvesAndArm(robot, RigidArm(3))
     run(stepped, iter([np.full(12, 0.1)]), lambda line: lines.append(json.dumps(line)), sleep=lambda seconds: None)
     assert [json.loads(line)["event"] for line in lines] == ["ready", "state", "summary"]
+
+
+@pytest.mark.parametrize(("pull_downs", "after"), [(True, 0.1 * np.exp(-1.0)), (False, 0.1)])
+def test_floating_pin_falls_with_a_pull_down_and_holds_without(robot, pull_downs, after):
+    pins = FilteredPins(pull_downs)
+    assert not pins.advance(np.array([np.nan, np.nan]), 1.0).any(), "nothing was commanded yet"
+    pins.advance(np.array([0.1, 0.05]), 0.02)
+    for _ in range(11):
+        command = pins.advance(np.array([np.nan, 0.05]), 0.01)
+    np.testing.assert_allclose(command, [after, 0.05])
+    np.testing.assert_array_equal(pins.advance(np.zeros(2), 0.02), [0.0, 0.0])
+
+
+@pytest.mark.parametrize("pull_downs", [True, False])
+def test_plant_with_floating_pins(robot, pull_downs):
+    plant = ValvesAndArm(robot, RigidArm(3), pull_downs)
+    plant.advance(np.full(11, 0.1), 0.02)
+    for _ in range(55):
+        plant.advance(np.full(11, np.nan), 0.02)
+    pressure = 0.3 * np.exp(-10.0) if pull_downs else 0.3
+    np.testing.assert_allclose(list(plant.channel_bar().values()), pressure)
+
+
+def test_null_in_the_pipe_is_a_floating_pin():
+    read, write = os.pipe()
+    try:
+        os.write(write, b'{"duty": [0.1, null]}\n')
+        np.testing.assert_array_equal(next(duties_from(read)), [0.1, np.nan])
+    finally:
+        os.close(read)
+        os.close(write)

@@ -43,7 +43,7 @@ def record():
         end_ns=ticks * 400_000_000,
         end_us=ticks * 400_000.0,
         reported_vented=True,
-        outputs=ValveOutputs(np.array([0]), np.zeros(1), np.zeros((1, 12)), 4096),
+        outputs=ValveOutputs(np.array([0]), np.zeros(1), np.zeros((1, 12)), np.zeros((1, 12), bool), 4096),
         board_events=[],
         board_dropped_bytes=0,
         board_late_ms=0.4,

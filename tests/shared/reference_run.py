@@ -33,7 +33,7 @@ def slewed(start, commanded):
 
 def outputs_at(mono_ns, duty):
     """Outputs of a board whose clock is the host's."""
-    return ValveOutputs(mono_ns, mono_ns * 1e-3, duty, COUNTS)
+    return ValveOutputs(mono_ns, mono_ns * 1e-3, duty, np.zeros(duty.shape, bool), COUNTS)
 
 
 def reference_run():

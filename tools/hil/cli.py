@@ -46,8 +46,15 @@ SETTLE_S = 1.5  # the traces continue for so long after the runtime, until the c
     "this USB serial number.",
 )
 @click.option("--yes", is_flag=True, help="With a real board: start without asking.")
+@click.option(
+    "--pull-downs/--no-pull-downs",
+    default=True,
+    help="With or without resistors of 10 kOhm from the valve pins to ground, see docs/hardware.md.",
+)
 @click.option("--steps", type=click.IntRange(1), help="Run only so many control steps.  [default: the whole task]")
-def cli(robot_file: str, model: Path, task: str, report: Path, board: str, yes: bool, steps: int | None) -> int:
+def cli(
+    robot_file: str, model: Path, task: str, report: Path, board: str, yes: bool, pull_downs: bool, steps: int | None
+) -> int:
     """Run a controller in real time on emulated hardware and check the run against its criteria.
 
     \b
@@ -94,7 +101,7 @@ def cli(robot_file: str, model: Path, task: str, report: Path, board: str, yes: 
 
     options = [] if steps is None else ["--steps", str(steps)]
     with report_folder.claimed(report):
-        rig = Rig(robot_file, report, rig_board)
+        rig = Rig(robot_file, report, rig_board, pull_downs=pull_downs)
         try:
             with rig:
                 rig.run(model, task, *options)
@@ -152,7 +159,9 @@ def _about(rig: Rig, robot_file: str, model: Path, task: str, steps: int | None,
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": f"modsoft-hil --robot {Path(robot_file).name} --model {model.name} --task {Path(task).name} "
-        f"--board {board.board}" + (f" --steps {steps}" if steps else ""),
+        f"--board {board.board}"
+        + (" --no-pull-downs" if not rig.pull_downs else "")
+        + (f" --steps {steps}" if steps else ""),
         "board": description,
         "board's clock": board.clock,
         "firmware, SHA-256": firmware,

@@ -9,10 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from modsoft.hil.plant import FilteredPins
 from modsoft.runtime.arrays import Array
 
 Event = dict[str, Any]
 
+STEP_US = 1000.0
+DOWN_DUTY = 0.05 / 3.0  # P_DOWN of 3 bar valves
 FULL_COUNTS = 4096  # of the firmware's timers, where no output ever opened
 
 
@@ -22,6 +25,7 @@ class ValveOutputs(NamedTuple):
     mono_ns: NDArray[np.int64]  # (E,), CLOCK_MONOTONIC of the host
     t_us: Array  # (E,), emulated time: the board's cycle counter
     duty: Array  # (E, channels), 0 to 1
+    floating: NDArray[np.bool_]  # (E, channels), the pin is an input
     counts: int  # of a full duty
 
     def between(self, start_ns: int, end_ns: int) -> Array:
@@ -41,16 +45,34 @@ class ValveOutputs(NamedTuple):
         return max(0.0, float(self.t_us[closed_row] - since_us) * 1e-3) if closed_row < len(self.duty) else math.inf
 
 
+def command_down_after_ms(outputs: ValveOutputs, since_us: float, until_us: float, pull_downs: bool) -> float:
+    """Emulated milliseconds from `since_us` until the command of every valve stays below `DOWN_DUTY` up to `until_us`;
+    infinite where one does not. The command of a floating pin is the voltage of its filter (`FilteredPins`)."""
+    filters = FilteredPins(pull_downs)
+    driven = np.where(outputs.floating, np.nan, outputs.duty)
+    row = 0
+    now_us, last_up_us = float(min([since_us, *outputs.t_us[:1]])), -math.inf
+    while len(driven) and now_us < until_us:
+        while row + 1 < len(driven) and outputs.t_us[row + 1] <= now_us:
+            row += 1
+        command = filters.advance(driven[row], STEP_US * 1e-6)
+        now_us += STEP_US
+        if now_us > since_us and np.any(command >= DOWN_DUTY):
+            last_up_us = now_us
+    return math.inf if last_up_us >= until_us else max(0.0, (last_up_us - since_us) * 1e-3)
+
+
 def read_outputs(events: Sequence[Event]) -> ValveOutputs:
     """The outputs over time, a row for each change. `ValueError` where the timers count to different tops."""
     changes = [event for event in events if event["event"] == "pwm"]
     ready = [event["channels"] for event in events if event["event"] == "ready"]
     channels = max([*ready, *(event["channel"] + 1 for event in changes)], default=0)
-    duty = np.zeros((len(changes), channels))
-    current = np.zeros(channels)
+    duty, floating = np.zeros((len(changes), channels)), np.zeros((len(changes), channels), dtype=bool)
+    current, floating_now = np.zeros(channels), np.zeros(channels, dtype=bool)
     for row, event in enumerate(changes):
         current[event["channel"]] = event["duty"]
-        duty[row] = current
+        floating_now[event["channel"]] = event.get("floating", False)
+        duty[row], floating[row] = current, floating_now
     tops = {event["raw"][1] for event in changes if event["duty"] > 0}
     if len(tops) > 1:
         raise ValueError(f"the board's timers count to different tops: {sorted(tops)}")
@@ -58,6 +80,7 @@ def read_outputs(events: Sequence[Event]) -> ValveOutputs:
         np.array([event["mono_ns"] for event in changes], dtype=np.int64),
         np.array([event["t_us"] for event in changes], dtype=np.float64),
         duty,
+        floating,
         max(tops, default=FULL_COUNTS - 1) + 1,
     )
 
@@ -67,11 +90,13 @@ def read_reported(events: Sequence[Event]) -> ValveOutputs:
     scale of the valves, so that a count is the unit of the protocol, 10 Pa."""
     hello = next(event for event in events if event["event"] == "serial")
     reports = [event for event in events if event["event"] == "status"]
+    shape = len(reports), hello["channels"]
     applied = np.array([event["applied"][: hello["channels"]] for event in reports], dtype=np.float64)
     return ValveOutputs(
         np.array([event["mono_ns"] for event in reports], dtype=np.int64),
         np.array([event["t_us"] for event in reports], dtype=np.float64),
-        applied.reshape(len(reports), hello["channels"]) / hello["p_full"],
+        applied.reshape(shape) / hello["p_full"],
+        np.zeros(shape, dtype=bool),
         hello["p_full"],
     )
 

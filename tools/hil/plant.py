@@ -8,12 +8,14 @@ each valve channel in [0, 1]; its end ends the process. Standard output, one JSO
                                                  time at which the state is due
     {"event": "summary", ...}                    slices, lateness
 
-The valves are ideal: a duty is that share of the full-scale pressure. Lag and chamber belong to `modsoft.training`.
+The valves are ideal: a duty is that share of the full-scale pressure; null is a pin that floats (`FilteredPins`). Lag
+and chamber belong to `modsoft.training`.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import select
 import sys
@@ -66,6 +68,28 @@ def set_points_bar(robot: Robot, duty: Array) -> Array:
     return set_points
 
 
+class FilteredPins:
+    """Command at every valve, 0 to 1, behind the filter of its pin (docs/hardware.md: 1 kOhm, 10 uF).
+
+    A driven pin sets the command to its duty. While a pin floats, the capacitor holds the command; a pull-down of
+    10 kOhm discharges it.
+    """
+
+    TIME_CONSTANT_S = 11e3 * 10e-6
+
+    def __init__(self, pull_downs: bool):
+        self.command: Array = np.zeros(0)
+        self._pull_downs = pull_downs
+
+    def advance(self, duty: Array, duration_s: float) -> Array:
+        """Command (channels,) after this time; duty (channels,), NaN where the pin floats."""
+        if len(self.command) < len(duty):
+            self.command = np.concatenate([self.command, np.zeros(len(duty) - len(self.command))])
+        decay = math.exp(-duration_s / self.TIME_CONSTANT_S) if self._pull_downs else 1.0
+        self.command = np.where(np.isnan(duty), self.command * decay, duty) if len(duty) else self.command
+        return self.command
+
+
 def tool_poses(positions: Array, directors: Array) -> Array:
     """Poses (N + 1, 4, 4) of the tools in the tracker's frame, base first: axes as columns, positions in mm.
 
@@ -88,14 +112,15 @@ def load_robot(file_or_name: str | Path) -> Robot:
 class ValvesAndArm:
     """The arm behind its valves: duties in, poses and chamber pressures out."""
 
-    def __init__(self, robot: Robot, arm: PneumaticArm):
+    def __init__(self, robot: Robot, arm: PneumaticArm, pull_downs: bool = True):
+        self.pins = FilteredPins(pull_downs)
         self.robot = robot
         self.arm = arm
         self.time_s = 0.0
 
     def advance(self, duty: Array, duration_s: float) -> None:
-        """Advances the arm with the duties (channels,) held."""
-        self.arm.set_pressures(set_points_bar(self.robot, duty))
+        """Advances the arm with the duties (channels,) held; NaN: the pin floats."""
+        self.arm.set_pressures(set_points_bar(self.robot, self.pins.advance(duty, duration_s)))
         self.arm.advance(duration_s)
         self.time_s += duration_s
 
@@ -168,7 +193,8 @@ def duties_from(descriptor: int) -> Iterator[Array | None]:
 
 @click.command("modsoft-hil-plant")
 @click.option("--robot", "file_or_name", required=True, type=Path, help="Robot file, or the name of a shipped robot.")
-def cli(file_or_name: Path) -> None:
+@click.option("--pull-downs/--no-pull-downs", default=True, help="Resistors of 10 kOhm from the valve pins to ground.")
+def cli(file_or_name: Path, pull_downs: bool) -> None:
     """The simulated pneumatic robot in real time (started by modsoft-hil)."""
     from modsoft.training.simulation.elastica import Arm  # the simulator takes a second to import
 
@@ -182,7 +208,7 @@ def cli(file_or_name: Path) -> None:
     warm = ValvesAndArm(robot, arm)
     warm.advance(np.zeros(0), SLICE_S)  # compiles
     arm.reset()
-    run(ValvesAndArm(robot, arm), duties_from(sys.stdin.fileno()), write)
+    run(ValvesAndArm(robot, arm, pull_downs), duties_from(sys.stdin.fileno()), write)
 
 
 main = entry(cli)

@@ -110,12 +110,15 @@ class Rig:
     """Context manager: the board is at `board.port`, the tracker at `tracker_port`, and the robot hangs at rest in real
     time; `run` starts modsoft-runtime on them."""
 
-    def __init__(self, robot_file: str | Path, folder: Path, board: str | SerialBoard = "auto"):
+    def __init__(
+        self, robot_file: str | Path, folder: Path, board: str | SerialBoard = "auto", pull_downs: bool = True
+    ):
         """`robot_file`: file or shipped name; `folder`: of the traces and the runtime's output; `board`: an emulated
         board's name, or a real board after its `check`."""
         self.robot = load_robot(robot_file)
         self._robot_file = str(Path(robot_file).resolve() if Path(robot_file).is_file() else robot_file)
         self.folder = folder
+        self.pull_downs = pull_downs
         self.runs: Path | None = None  # where the latest runtime logs
         self._follower: Follower | None = None  # of that log
         self.board: EmulatedBoard | SerialBoard
@@ -149,7 +152,8 @@ class Rig:
             self.tracker = Child("modsoft.hil.polaris", fake, lambda line: None)
             exits.callback(self.tracker.stop)
             self.tracker.wait_ready()
-            self.plant = Child("modsoft.hil.plant", ["--robot", self._robot_file], self._plant_state)
+            resistors = "--pull-downs" if self.pull_downs else "--no-pull-downs"
+            self.plant = Child("modsoft.hil.plant", ["--robot", self._robot_file, resistors], self._plant_state)
             # A thread that forwards lines may be blocked by a process that hangs: the receiving process ends first.
             forwarder = threading.Thread(target=self._forward_duties, name="duties", daemon=True)
             exits.callback(lambda: forwarder.join() if forwarder.ident else None)
@@ -263,7 +267,7 @@ class Rig:
         while not self._closing.is_set():
             if self._changed.wait(0.1):
                 self._changed.clear()
-                self.plant.send({"duty": self.board.duties()})
+                self.plant.send({"duty": self.board.driven_duties()})
                 time.sleep(FORWARD_PERIOD_S)
 
     def _plant_state(self, state: Line) -> None:

@@ -12,6 +12,7 @@
  *   supply MILLIVOLT                          supply of the chip, 5000 at first: scale of the converter
  *   sensors TAU_MS                            pressure sensors follow their valves with a first-order lag until `adc`
  *   reset | power-cycle                       reset pin; power off and on (RAM lost)
+ *   power-off                                 no power until power-cycle
  *   hang [cli]                                the main loop stops until a reset; cli: interrupts are off too
  *   unplug | plug [PATH]                      pull the USB cable (the board keeps its power); back in, under a new name
  *   corrupt-rx|drop-rx|insert-rx P [SEED]     serial noise towards the board, probability of each byte
@@ -53,6 +54,7 @@
 #include "sim_elf.h"
 #include "sim_hex.h"
 
+#define NEVER (~(ticks_t)0)
 #define RJMP_SELF 0xCFFF /* rjmp .-2 */
 
 const char *const board_name = "simavr";
@@ -61,7 +63,8 @@ struct board_load board_load;
 avr_t *avr;
 
 static const char *reset_cause;
-static ticks_t held_until; /* end of the reset; 0: running */
+static uint8_t flags_before; /* MCUSR at the reset: only power-on and the program clear its bits */
+static ticks_t held_until;   /* end of the reset; 0: running */
 static bool chip_was_reset, halted_reported;
 static void (*chip_reset)(avr_t *);
 static unsigned adc_mv[ADC_CHANNELS];
@@ -94,9 +97,12 @@ static void enter_reset(const char *cause) {
 }
 
 static void leave_reset(void) {
+  bool power_on = !strcmp(reset_cause, "power-on");
+  uint8_t flags = power_on ? 0 : flags_before;
+  bool watchdog_on = !strcmp(reset_cause, "watchdog") || flags & 1 << WDRF; /* it stays on while WDRF is set */
   for (avr_io_t *io = avr->io_port; io; io = io->next) {
-    if (!strcmp(io->kind, "watchdog") && !strcmp(reset_cause, "watchdog")) {
-      avr_watchdog_t *watchdog = (avr_watchdog_t *)io; /* it stays on after the reset that it caused */
+    if (!strcmp(io->kind, "watchdog") && watchdog_on) {
+      avr_watchdog_t *watchdog = (avr_watchdog_t *)io;
       watchdog->reset_context.wdrf = 1;
       watchdog->reset_context.avr_run = avr->run;
     }
@@ -104,9 +110,11 @@ static void leave_reset(void) {
   avr_reset(avr);
   if (!strcmp(reset_cause, "external")) {
     avr->data[MCUSR] |= 1 << EXTRF;
-  } else if (!strcmp(reset_cause, "power-on")) {
+  } else if (power_on) {
     avr->data[MCUSR] |= 1 << PORF;
   }
+  avr->data[MCUSR] |= flags;
+  flags_before = avr->data[MCUSR];
   for (int i = 0; i < EXTINT_COUNT; i++) {
     avr_extint_set_strict_lvl_trig(avr, i, 0); /* otherwise simavr polls the low pins in every cycle: 0.35x real time */
   }
@@ -129,6 +137,11 @@ void board_power_cycle(void) {
     }
   }
   enter_reset("power-on");
+}
+
+void board_power_off(void) {
+  board_power_cycle();
+  held_until = NEVER;
 }
 
 bool board_runs_firmware(void) { return !held_until && !(avr->reset_pc && avr->pc >= avr->reset_pc); }
@@ -169,6 +182,8 @@ void board_run(ticks_t until) {
     avr->run(avr);
     if (chip_was_reset) {
       enter_reset("watchdog");
+    } else {
+      flags_before = avr->data[MCUSR];
     }
     if (avr->state == cpu_Done || avr->state == cpu_Crashed) { /* asleep with interrupts off, or crashed: time passes */
       if (!halted_reported) {

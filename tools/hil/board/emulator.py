@@ -69,7 +69,7 @@ class EmulatedBoard:
         board: str = "auto",
         *,
         firmware: Path | None = None,
-        bootloader: bool = True,
+        bootloader: bool | Path = True,
         port_link: Path | None = None,
         fast: bool = False,
         stepped: bool = False,
@@ -78,7 +78,8 @@ class EmulatedBoard:
         """Prepare a board; nothing is built or started before `start`.
 
         firmware: an ELF or Intel hex file; the project's own, freshly built, where it is None. simavr only.
-        bootloader: run behind the MEGA's real bootloader, as a board from the shop does. simavr only.
+        bootloader: run behind the MEGA's real bootloader, as a new board does, or behind that of an Intel hex file.
+        simavr only.
         port_link: where the link to the serial port goes; a temporary folder where it is None.
         fast: run as fast as it can. The board's time-outs then fire early for a host in real time: only emulated
         times (`t_us`) are meaningful.
@@ -96,6 +97,7 @@ class EmulatedBoard:
         self._sending = threading.Lock()
         self._changed = threading.Condition()
         self._duties: list[float] = []
+        self._floating: list[bool] = []
         self.trace: list[Event] = []
         self.ready: Event = {}
         self.last_run: Event = {"t_us": 0.0, "from_host": 0, "to_host": 0}  # the last `run`; stepped only
@@ -122,7 +124,8 @@ class EmulatedBoard:
         command = [str(program), "--port-link", str(self._link)]
         if self.board == "simavr":
             command += ["--elf", str(self._firmware or FIRMWARE_ELF)]
-            command += ["--bootloader", str(BOOTLOADER)] if self._bootloader else []
+            bootloader = BOOTLOADER if self._bootloader is True else self._bootloader
+            command += ["--bootloader", str(bootloader)] if bootloader else []
         command += self._pace
         self._stderr = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
@@ -160,6 +163,12 @@ class EmulatedBoard:
         """The effective duty of each channel now, 0 to 1, in the order of firmware/pins.h."""
         with self._changed:
             return list(self._duties)
+
+    def driven_duties(self) -> list[float | None]:
+        """`duties`, with None where the pin is an input now, as from a reset to the start of the firmware."""
+        with self._changed:
+            pins = zip(self._duties, self._floating, strict=True)
+            return [None if floating else duty for duty, floating in pins]
 
     def millivolt(self, pressure_bar: float) -> int:
         """Voltage of a sensor on this board at a pressure, for the command `adc`."""
@@ -206,14 +215,20 @@ class EmulatedBoard:
             event = decode(line)
             with self._changed:
                 if event["event"] == "ready":
-                    self._duties += [0.0] * (event["channels"] - len(self._duties))
+                    self._resize(event["channels"])
                 elif event["event"] == "pwm":
-                    self._duties += [0.0] * (event["channel"] + 1 - len(self._duties))
+                    self._resize(event["channel"] + 1)
                     self._duties[event["channel"]] = event["duty"]
+                    self._floating[event["channel"]] = event["floating"]
                 self.trace.append(event)
                 self._changed.notify_all()
             if self._on_event is not None:
                 self._on_event(event)
+
+    def _resize(self, channels: int) -> None:
+        missing = channels - len(self._duties)
+        self._duties += [0.0] * missing
+        self._floating += [True] * missing
 
     def __enter__(self) -> EmulatedBoard:
         return self.start()

@@ -95,6 +95,8 @@ static bool run_command(char *line) {
     board_reset_pin();
   } else if (!strcmp(verb, "power-cycle")) {
     board_power_cycle();
+  } else if (!strcmp(verb, "power-off")) {
+    board_power_off();
   } else if (!strcmp(verb, "hang")) {
     known = board_hang(!strcmp(rest, "cli"));
   } else if (!strcmp(verb, "unplug")) {

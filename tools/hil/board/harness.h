@@ -46,6 +46,7 @@ ticks_t board_now(void);
 void board_run(ticks_t until);        /* may overshoot by one instruction */
 void board_reset_pin(void);           /* what DTR does when the port is opened */
 void board_power_cycle(void);         /* a reset that also loses the RAM */
+void board_power_off(void);           /* until the next power cycle: every pin floats */
 bool board_runs_firmware(void);       /* false: in reset, or in the bootloader */
 bool board_hang(bool interrupts_off); /* stops the main loop until the next reset; false: not possible now */
 void board_set_adc(unsigned input, unsigned millivolt);

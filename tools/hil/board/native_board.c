@@ -15,6 +15,7 @@
 #define WATCHDOG_TICKS (128 * 1000 * TICKS_PER_US) /* WDTO_120MS is 16384 cycles of 128 kHz */
 #define TX_BUFFER 64
 #define ADC_COUNTS 1024
+#define NEVER (~(ticks_t)0 / 2)
 
 const char *const board_name = "native";
 const unsigned board_channels = CHANNELS_USED;
@@ -122,6 +123,11 @@ void board_power_on(const struct options *options) {
     measured[channel] = SENSORS >> channel & 1 ? 0 : PROTOCOL_NOT_MEASURED;
   }
   board_power_cycle();
+}
+
+void board_power_off(void) {
+  board_power_cycle();
+  started = next_loop = watchdog_fed = NEVER;
 }
 
 bool board_runs_firmware(void) { return now >= started; }

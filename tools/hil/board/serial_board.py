@@ -94,6 +94,10 @@ class SerialBoard:
         """Applied pressure of each channel by the last STATUS, as a fraction of the full scale, 0 to 1."""
         return list(self._duties)
 
+    def driven_duties(self) -> list[float | None]:
+        """`duties`: a STATUS does not report floating pins."""
+        return list(self._duties)
+
     # ---- The pseudo-terminal
 
     @property
