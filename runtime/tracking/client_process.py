@@ -23,7 +23,9 @@ from modsoft.runtime.tracking import messages
 from modsoft.runtime.tracking.frame import FrameError, Source, TrackerFrame
 
 WAIT_S = 0.05  # for a message, in one `read`
-SILENCE_S = 0.6  # of a connected client, which ends a blocked read after 0.3 s where the system can
+SILENCE_S = (
+    1.0  # of a connected client, which ends a blocked read after 0.3 s where the system can; a busy host delays it
+)
 IDLE_S = 0.1  # between two messages of a client without frames
 CONNECT_S = 20.0  # for a client that opens its tracker: a mute serial port takes 5 s at each of several commands
 RETRY_S = 0.2  # between two attempts to open a lost tracker
