@@ -21,24 +21,24 @@ def run(name, *arguments, folder):
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
-def test_an_example_has_at_most_forty_lines(path):
+def test_example_has_at_most_forty_lines(path):
     assert len(path.read_text(encoding="utf-8").splitlines()) <= 40
 
 
-def test_a_simulated_robot_follows_its_task(tmp_path):
+def test_simulated_robot_follows_its_task(tmp_path):
     lines = run("control_simulated_robot.py", folder=tmp_path).splitlines()
     assert [line.split(":")[0] for line in lines] == ["module 1", "module 2", "module 3"]
     assert max(float(line.split()[-2]) for line in lines) < 2.0
 
 
 @pytest.mark.realtime
-def test_the_board_arms_and_vents(tmp_path):
+def test_board_arms_and_vents(tmp_path):
     output = run("talk_to_the_board.py", folder=tmp_path)
     assert "0.1 " in output.split("commanded, bar:")[1]
     assert "vented: True" in output
 
 
-def test_a_run_log_becomes_a_picture(tmp_path):
+def test_run_log_becomes_a_picture(tmp_path):
     log = RunLog(tmp_path / "runs", "arm", "", {})
     for step in range(5):
         configuration = from_angles_deg(np.array([0.0, 5.0, 9.0]) * step)

@@ -527,7 +527,7 @@ def test_sensor_shows_a_valve_that_stays_open(rig):
     assert 950 <= port.now_ms - began_ms <= 1100
 
 
-def test_host_waits_for_an_empty_robot_no_longer_than_needed(rig):
+def test_host_waits_for_a_vented_robot_no_longer_than_needed(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)

@@ -259,7 +259,7 @@ def test_the_flags_of_the_chip_give_the_cause(chip, flags, cause):
 
 
 @pytest.mark.parametrize(("hung_ms", "cause"), [(99, ResetCause.EXTERNAL), (100, ResetCause.WATCHDOG)])
-def test_behind_the_bootloader_the_clock_shows_a_watchdog_reset(chip, hung_ms, cause):
+def test_clock_shows_a_watchdog_reset_after_the_bootloader(chip, hung_ms, cause):
     chip.boot()
     chip.code.boot_feed_watchdog(5000)
     chip.millis.value = 5000 + hung_ms

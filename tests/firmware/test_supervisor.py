@@ -579,7 +579,7 @@ def test_no_set_point_opens_a_valve_while_idle(board):
 
 
 @pytest.mark.parametrize(("taken", "refusals"), [(11, 4), (10, 3)])
-def test_queue_for_the_host_holds_255_bytes(board, taken, refusals):
+def test_queue_to_the_host_accepts_255_bytes(board, taken, refusals):
     """A full ring buffer would look like an empty one: 256 bytes must not be queued."""
     first = b"".join(bytes([board.library.supervisor_next_byte(board.handle)]) for _ in range(taken))
     board.feed(codec.encode(Vent(VentMode.RAMP)) * 2)

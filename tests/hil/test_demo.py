@@ -39,7 +39,7 @@ def stage(demo, *options):
     return demo.Stage("make it", command, demo.FOLDER / "result", [Path("input.txt")], "modsoft.training.made_from")
 
 
-def test_stage_is_made_once(demo):
+def test_finished_stage_is_not_repeated(demo):
     assert demo.make(stage(demo), "[1/1]") == 0
     assert demo.make(stage(demo), "[1/1]") == 0
     assert demo.ran == ["tool"]

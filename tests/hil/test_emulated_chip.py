@@ -39,7 +39,7 @@ class Probe:
 
 
 @pytest.mark.usefixtures("simavr")
-def test_duty_is_what_the_pin_does(probe: Path) -> None:
+def test_duty_is_that_of_the_pin(probe: Path) -> None:
     with EmulatedBoard("simavr", firmware=probe, bootloader=False) as board:
         chip = Probe(board)
         assert chip.duty(b"c") == (0.0, [0, 0]), "an input drives nothing"
@@ -53,7 +53,7 @@ def test_duty_is_what_the_pin_does(probe: Path) -> None:
 
 
 @pytest.mark.usefixtures("simavr")
-def test_uart_loses_what_the_chip_would_lose(probe: Path) -> None:
+def test_uart_loses_the_bytes_that_the_chip_loses(probe: Path) -> None:
     with EmulatedBoard("simavr", firmware=probe, bootloader=False) as board:
         chip = Probe(board)
         chip.port.write(b"d0123456789")
@@ -66,7 +66,7 @@ def test_uart_loses_what_the_chip_would_lose(probe: Path) -> None:
 
 @pytest.mark.usefixtures("simavr")
 @pytest.mark.parametrize("millivolt", [0, 1234, 5000])
-def test_analogue_input_reads_what_was_set(probe: Path, millivolt: int) -> None:
+def test_analogue_input_returns_the_set_value(probe: Path, millivolt: int) -> None:
     with EmulatedBoard("simavr", firmware=probe, bootloader=False) as board:
         chip = Probe(board)
         board.send(f"adc 3 {millivolt}")

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.realtime
 PRESSURES_BAR = (0.08, 0.35, 0.1, 0.2, 0.3, 0.25, 0.08, 0.35, 0.12, 0.17, 0.33)
 
 
-def test_duties_are_what_was_commanded(board_name: str, drive: Any) -> None:
+def test_duties_equal_the_commands(board_name: str, drive: Any) -> None:
     with EmulatedBoard(board_name) as board:
         board.send("sensors 20")
         host = drive(board, *map(str, PRESSURES_BAR))
@@ -106,16 +106,16 @@ def resets_with(folder: Path, name: str, old: str, new: str) -> list[str]:
         return [event["cause"] for event in board.trace if event["event"] == "reset"]
 
 
-def test_every_check_is_found_and_together_they_feed_the_watchdog(firmware_copy: Path) -> None:
+def test_every_check_is_listed_and_all_of_them_feed_the_watchdog(firmware_copy: Path) -> None:
     assert len(CHECKS) == 8
     assert resets_with(firmware_copy, "supervisor.c", "", "") == ["power-on"]
 
 
-def test_a_converter_that_is_off_starves_the_watchdog(firmware_copy: Path) -> None:
+def test_disabled_converter_stops_the_watchdog_feed(firmware_copy: Path) -> None:
     assert "_BV(ADEN) | " in (FIRMWARE / "sensors.c").read_text()
     assert "watchdog" in resets_with(firmware_copy, "sensors.c", "_BV(ADEN) | ", "")
 
 
 @pytest.mark.parametrize(("name", "line"), CHECKS, ids=[re.search(r"= (\w+)", line)[1] for _, line in CHECKS])
-def test_a_missing_check_starves_the_watchdog(firmware_copy: Path, name: str, line: str) -> None:
+def test_missing_check_stops_the_watchdog_feed(firmware_copy: Path, name: str, line: str) -> None:
     assert "watchdog" in resets_with(firmware_copy, name, line, re.sub("= .*;", "= 0;", line))

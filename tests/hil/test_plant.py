@@ -50,7 +50,7 @@ def robot():
     return robot_file.load("pneumatic-3")
 
 
-def test_the_set_points_undo_what_the_runtime_sends(robot):
+def test_set_points_invert_the_commands_of_the_runtime(robot):
     actuation = np.array([[0.3], [-1.0], [0.0]])
     duty = channel_pressures_bar(robot, actuation) / robot.valve.full_scale_bar
     np.testing.assert_allclose(set_points_bar(robot, duty), pressures_bar(robot, actuation), atol=1e-12)
@@ -60,7 +60,7 @@ def test_no_duty_is_no_pressure(robot):
     assert not set_points_bar(robot, np.zeros(0)).any()
 
 
-def test_the_tracker_sees_the_configuration(robot):
+def test_tracker_sees_the_configuration(robot):
     arm = RigidArm(3)
     arm.set_pressures([[0.3, 0.08], [0.08, 0.35], [0.2, 0.1]])
     poses = tool_poses(arm.positions, arm.directors)
@@ -84,7 +84,7 @@ class Time:
         self.now_ns += round(seconds * 1e9)
 
 
-def test_slices_keep_to_absolute_deadlines_and_catch_up(robot):
+def test_slices_have_absolute_deadlines_and_catch_up(robot):
     time, lines, arm = Time(), [], RigidArm(3)
     start = time.now_ns
 
@@ -114,7 +114,7 @@ def test_duties_are_held_until_new_ones_come(robot):
     assert lines[2]["channel_bar"] == pytest.approx({chamber.channel: 0.3 for chamber in robot.chambers})
 
 
-def test_the_newest_duties_of_the_pipe_win_and_its_end_ends():
+def test_newest_duties_are_used_and_a_closed_pipe_ends():
     read, write = os.pipe()
     try:
         duties = duties_from(read)

@@ -272,7 +272,7 @@ def test_only_replies_while_tracking_are_damaged():
     assert device.sent(device.answer(framed("TX:0801")))[-1][1].endswith(b"\r")
 
 
-def test_an_unknown_fault_is_an_error():
+def test_unknown_fault_is_an_error():
     with pytest.raises(ValueError, match="explode"):
         Device().take({"explode": True})
 
@@ -297,7 +297,7 @@ def test_quaternion_gives_the_rotation_back(values):
     assert abs(found @ [w, x, y, z]) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_a_file_in_the_place_of_the_port_stays(tmp_path):
+def test_file_in_the_place_of_the_port_stays(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(UsageError, match="file: exists and is no link"):
         Pty(tmp_path / "file")
@@ -412,7 +412,7 @@ def relative(stack):
     ("kind", "options"),
     [("polaris", []), ("vega", ["--type", "vega"]), ("aurora", ["--type", "aurora", "--wired", "4"])],
 )
-def test_real_client_comes_again(kind, options, tmp_path):
+def test_real_client_reconnects(kind, options, tmp_path):
     """To each type that a robot file may have."""
     with Rig(tmp_path, 4, *options) as rig:
         rig.send(poses=poses(4))
@@ -456,7 +456,7 @@ def test_no_vega_at_the_address_is_one_line(tmp_path, monkeypatch):
 
 
 @pytest.mark.realtime
-def test_a_mute_device_is_an_error_not_a_hang(tmp_path):
+def test_mute_device_is_an_error(tmp_path):
     with Rig(tmp_path) as rig:
         rig.send(mute=True)
         began = time.monotonic()

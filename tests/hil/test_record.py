@@ -23,7 +23,7 @@ def test_lateness_is_that_of_the_run():
     assert math.isnan(record._board_lateness([], {}, 1e9, int(11e9))["board_late_ms"])
 
 
-def test_a_line_cut_by_a_kill_is_left_out(tmp_path):
+def test_line_cut_by_a_kill_is_left_out(tmp_path):
     (tmp_path / "x.jsonl").write_text(json.dumps({"tick": 0}) + "\n" + '{"tick": 1, "con')
     assert record.lines(tmp_path / "x.jsonl") == [{"tick": 0}]
 
@@ -50,7 +50,7 @@ def run_folder(tmp_path):
     return write
 
 
-def test_a_first_tick_that_sent_nothing_is_a_failed_run_with_a_report(run_folder, tmp_path):
+def test_first_tick_that_sent_nothing_is_a_failed_run_with_a_report(run_folder, tmp_path):
     found = run_folder()
     np.testing.assert_array_equal(found.commanded_bar[:, 5:7], [[0.08, 0], [0.2, 0]])
     assert found.missed == 1
@@ -61,7 +61,7 @@ def test_a_first_tick_that_sent_nothing_is_a_failed_run_with_a_report(run_folder
     assert "too late" in (tmp_path / "report.md").read_text()
 
 
-def test_a_run_without_a_first_set_point_has_none(run_folder):
+def test_run_without_a_first_set_point_has_none(run_folder):
     found = run_folder(start=False)
     assert found.start_ns is None
     assert not found.commanded_bar[0].any()
@@ -69,11 +69,11 @@ def test_a_run_without_a_first_set_point_has_none(run_folder):
 
 
 @pytest.mark.parametrize(("board", "expected"), [(5000, 0.5), (20000, 2.0), (30000, 2.0), (None, 2.0)])
-def test_the_slew_is_the_slower_one(run_folder, board, expected):
+def test_slew_is_the_slower_one(run_folder, board, expected):
     assert run_folder(slew=board).slew_bar_per_s == expected
 
 
-def test_the_firmware_has_a_hash_on_either_board():
+def test_firmware_has_a_hash_on_either_board():
     assert len(record.firmware_sha256("native")) == 64
 
 

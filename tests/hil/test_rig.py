@@ -141,7 +141,7 @@ def rig_command(folder, model):
 
 @pytest.mark.realtime
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
-def test_nothing_outlives_the_rig(number, code, model_file, tmp_path):
+def test_rig_leaves_no_process(number, code, model_file, tmp_path):
     out = tmp_path / "out"
     temporary = {"TMPDIR": str(tmp_path)}  # a killed process leaves its temporary folders
     with subprocess.Popen(
@@ -168,7 +168,7 @@ def test_nothing_outlives_the_rig(number, code, model_file, tmp_path):
         assert not duties[-1].any(), "the runtime is given the time to vent"
 
 
-def test_a_process_that_hangs_with_a_full_pipe_is_ended(tmp_path, monkeypatch):
+def test_process_that_hangs_with_a_full_pipe_is_ended(tmp_path, monkeypatch):
     (tmp_path / "deaf.py").write_text("import time\ntime.sleep(60)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(emulator, "STOP_TIMEOUT_S", 0.2)
@@ -190,7 +190,7 @@ def test_a_process_that_hangs_with_a_full_pipe_is_ended(tmp_path, monkeypatch):
 
 
 @pytest.mark.realtime
-def test_a_hanging_tracker_or_robot_does_not_keep_the_rig(tmp_path, monkeypatch):
+def test_rig_ends_despite_a_hanging_tracker_or_robot(tmp_path, monkeypatch):
     monkeypatch.setattr(emulator, "STOP_TIMEOUT_S", 0.3)
     with Rig("pneumatic-3", tmp_path, board="native") as rig:
         below = descendants(os.getpid())
@@ -204,7 +204,7 @@ def test_a_hanging_tracker_or_robot_does_not_keep_the_rig(tmp_path, monkeypatch)
 
 
 @pytest.mark.realtime
-def test_an_exception_inside_ends_everything(model_file, tmp_path):
+def test_exception_inside_ends_everything(model_file, tmp_path):
     below = []
 
     def break_off():

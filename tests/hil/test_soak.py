@@ -73,7 +73,7 @@ def test_fault_has_to_be_detected_and_named(fault, detected_ms, code, messages, 
     assert injected.failures == failures
 
 
-def test_board_that_vents_too_late_or_never_is_found():
+def test_late_or_missing_venting_is_detected():
     for last_ms, failures in ((1700, []), (1701, ["valves at 0 after 701 ms, limit 700"])):
         injected = InjectedFault(ENDING, 1, 0.0, mono_ns=10**9)
         check_fault(injected, SoakRun(1, code=74), True, LOST, events((900, 0.1), (last_ms, 0.0)))
@@ -129,7 +129,7 @@ def test_set_point_without_acknowledgement_may_not_have_arrived(reference):
     assert valve_failures(replace(stayed, acknowledged_ms=acknowledged)) == []
 
 
-def test_valve_left_open_or_opened_too_early_is_found(reference):
+def test_valve_left_open_or_opened_too_early_is_detected(reference):
     left = reference.outputs._replace(duty=np.vstack([reference.outputs.duty[:-1], reference.outputs.duty[-2:-1]]))
     assert "a valve was left open" in valve_failures(replace(reference, outputs=left))
     early = with_output(reference, reference.start_ns - 2 * 10**9, reference.start_ns - 10**9, 1)

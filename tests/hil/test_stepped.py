@@ -19,7 +19,7 @@ def hello_at_s(port: SteppedPort) -> float:
         board.close()
 
 
-def test_time_stands_still_between_two_steps(board_name: str) -> None:
+def test_time_does_not_advance_between_steps(board_name: str) -> None:
     with EmulatedBoard(board_name, stepped=True) as board:
         board.run(1500, 0)
         before_us = board.last_run["t_us"]
@@ -40,7 +40,7 @@ def test_every_opening_takes_the_same_time(board_name: str) -> None:
     assert max(took_s) - min(took_s) < 0.0051  # one step
 
 
-def test_what_was_written_is_there_in_the_next_step(board_name: str) -> None:
+def test_written_bytes_arrive_in_the_next_step(board_name: str) -> None:
     with EmulatedBoard(board_name, stepped=True) as board:
         port = SteppedPort(board)
         port.idle(1.0)

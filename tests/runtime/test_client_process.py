@@ -133,7 +133,7 @@ def test_client_ignores_ctrl_c_and_a_closed_terminal(opened, tmp_path):
     assert errors == []
 
 
-def test_what_the_client_prints_goes_nowhere(opened, capfd):
+def test_output_of_the_client_is_discarded(opened, capfd):
     frames_and_errors(opened(tracker_clients.printing), lambda frames, errors: frames)
     assert capfd.readouterr().out == ""
 

@@ -50,7 +50,7 @@ def test_lateness_does_not_add_up():
         time.time_s += 0.13  # the work of a step
 
 
-def test_a_step_that_takes_too_long_costs_one_slot_and_no_burst():
+def test_long_step_skips_one_slot_without_a_burst():
     time = Time()
     ticker = time.ticker()
     ticker.next()
@@ -60,7 +60,7 @@ def test_a_step_that_takes_too_long_costs_one_slot_and_no_burst():
     assert tick.start_s == pytest.approx(tick.due_s, abs=1e-9)
 
 
-def test_a_slot_less_than_half_a_period_late_still_runs():
+def test_slot_less_than_half_a_period_late_still_runs():
     time = Time()
     ticker = time.ticker()
     ticker.next()
@@ -73,7 +73,7 @@ def test_a_slot_less_than_half_a_period_late_still_runs():
     assert ticker.too_late(1)
 
 
-def test_after_a_long_sleep_of_the_machine_it_goes_on_in_step():
+def test_ticker_keeps_its_phase_after_a_long_suspension():
     time = Time()
     ticker = time.ticker()
     ticker.next()
@@ -83,14 +83,14 @@ def test_after_a_long_sleep_of_the_machine_it_goes_on_in_step():
     assert abs(tick.lateness_s) < 1e-6
 
 
-def test_first_slot_can_be_put_off():
+def test_first_slot_can_be_postponed():
     time = Time()
     ticker = time.ticker()
     ticker.start(0.4)
     assert ticker.next().start_s == pytest.approx(1000.4)
 
 
-def test_idle_is_asked_at_least_every_slice_and_may_raise():
+def test_idle_is_called_at_least_every_slice_and_may_raise():
     time = Time()
     ticker = time.ticker()
     ticker.next()
@@ -144,7 +144,7 @@ def test_never_two_ticks_in_one_period(overshoots, count):
     assert periods == sorted(set(periods))
 
 
-def test_a_command_that_was_held_up_puts_off_the_next_slot():
+def test_delayed_command_postpones_the_next_slot():
     time = Time()
     ticker = time.ticker()
     ticker.next()
@@ -158,7 +158,7 @@ def test_a_command_that_was_held_up_puts_off_the_next_slot():
     assert tick.start_s == pytest.approx(1000.0 + 1.2)
 
 
-def test_a_preparation_uses_time_of_the_wait_and_delays_no_slot():
+def test_preparation_runs_during_the_wait_and_delays_no_slot():
     time = Time()
     ticker = time.ticker()
     ticker.next()

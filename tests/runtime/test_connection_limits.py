@@ -18,7 +18,7 @@ FOREIGN_HASH = 0x0123ABCD
 # ---- before HELLO
 
 
-def test_new_connection_waits_and_knows_nothing():
+def test_new_connection_waits_for_hello():
     connection = Connection(5.0)
     assert (connection.phase, connection.discovery.dtr, connection.discovery.resets) == (Phase.WAITING, True, 0)
     assert connection.hello is connection.foreign_hash is connection.status is connection.lost is None
@@ -61,7 +61,7 @@ def test_silent_board_is_reset_three_times_then_given_up():
     assert connection.lost_at == opened + 3.0
 
 
-def test_running_board_is_asked_for_hello_once_in_a_while():
+def test_hello_is_requested_periodically_from_a_running_board():
     connection = Connection(10.0)
     connection.feed(encode(IDLE), 11.4)
     assert connection.poll(11.49) == b""
@@ -74,7 +74,7 @@ def test_running_board_is_asked_for_hello_once_in_a_while():
 
 
 @pytest.mark.parametrize(("age_s", "asked"), [(0.19, True), (0.2, False), (0.25, False)])
-def test_only_a_board_that_still_sends_is_asked_for_hello(age_s, asked):
+def test_hello_is_requested_only_from_a_board_that_sends(age_s, asked):
     connection = Connection(-1.6)
     connection.feed(encode(IDLE), 0.0)
     assert bool(connection.poll(age_s)) is asked
@@ -103,7 +103,7 @@ def test_bytes_from_before_a_reset_do_not_count_after_it():
 
 
 @pytest.mark.parametrize(("first_byte_s", "lost"), [(11.49, False), (11.5, True), (12.0, True), (12.04, False)])
-def test_other_device_is_one_that_sends_for_half_a_second_once_firmware_had_to_run(first_byte_s, lost):
+def test_other_device_is_detected_after_half_a_second_of_its_bytes(first_byte_s, lost):
     connection = Connection(10.0)
     connection.feed(b"ready > ", first_byte_s)
     connection.poll(12.49)

@@ -32,7 +32,7 @@ def running():
 
 
 @pytest.mark.parametrize(("board_session", "expected"), [(0, 1), (1, 2), (254, 255), (255, 1)])
-def test_arm_asks_for_the_next_session(board_session, expected):
+def test_arm_requests_the_next_session(board_session, expected):
     connection = ready()
     connection.feed(encode(IDLE, session=board_session), 0.1)
     connection.arm(0x3F, 30000)

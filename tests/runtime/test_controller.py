@@ -100,7 +100,7 @@ def test_output_far_out_of_range_is_refused_and_kept_for_the_log(output):
     assert controller.raw is not None
 
 
-def test_a_preview_computes_the_step_and_changes_nothing():
+def test_preview_computes_the_step_and_changes_nothing():
     policy = Policy([0.5, 1.5, -1.5])
     controller = Controller(ROBOT, policy, REST)
     before = repr(vars(controller)), repr(vars(controller.window))

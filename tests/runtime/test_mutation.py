@@ -64,7 +64,7 @@ def test_repeated_changes_of_the_same_text_are_numbered(changes):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a mutant runs in a fork")
-def test_one_mutant_in_forty_of_the_connection_is_noticed():
+def test_every_fortieth_mutant_of_the_connection_is_detected():
     command = [sys.executable, TOOLS / "mutate_runtime.py", "--source", "board/connection.py", "--every", "40"]
     done = subprocess.run([*command, "--jobs", "1"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -72,7 +72,7 @@ def test_one_mutant_in_forty_of_the_connection_is_noticed():
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a mutant runs in a fork")
-def test_mutant_that_no_test_notices_survives(tmp_path):
+def test_undetected_mutant_survives(tmp_path):
     """The same mutants, but with a list of equivalents that lacks the one reason that is needed."""
     code = """
 import sys, pathlib

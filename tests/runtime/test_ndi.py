@@ -83,7 +83,7 @@ def test_poses_are_those_of_the_client():
         "01" + record(99, 5) + "0000",
     ],
 )
-def test_nonsense_gives_no_frame(text):
+def test_invalid_reply_gives_no_frame(text):
     with pytest.raises(FrameError, match="reply"):
         parsed(text)
 

@@ -74,7 +74,7 @@ WRONG = {
 
 @pytest.mark.parametrize("wrong", WRONG)
 @pytest.mark.parametrize("after", [[], ["", '{"event": "done"}']])
-def test_a_wrong_line_is_named(tmp_path, wrong, after):
+def test_invalid_line_is_named(tmp_path, wrong, after):
     with pytest.raises(DeviceAbsent, match=r"^tracker source replay: [^\n]*, line 3: [^\n]*$") as error:
         Replay(log(tmp_path, '{"event": "start"}', line(1), WRONG[wrong], *(after or [line(2)])), TOOLS)
     assert error.value.exit_code == 69
@@ -82,7 +82,7 @@ def test_a_wrong_line_is_named(tmp_path, wrong, after):
 
 
 @pytest.mark.parametrize("content", [b"", b"\n\n", b"{}\n", b'{"event": "start"}\n{"tick": 0, "frame": null}'])
-def test_a_log_without_a_frame(tmp_path, content):
+def test_log_without_a_frame(tmp_path, content):
     (tmp_path / "run.jsonl").write_bytes(content)
     with pytest.raises(DeviceAbsent, match=r"no frame in [^\n]*; give the folder of a run of this robot$"):
         Replay(tmp_path, TOOLS)
@@ -96,36 +96,36 @@ def test_another_file_is_one_line(tmp_path, content):
 
 
 @pytest.mark.skipif(not Path("/dev/null").exists(), reason="device files of POSIX")
-def test_a_device_is_not_waited_for():
+def test_device_file_is_refused_without_reading():
     with pytest.raises(DeviceAbsent, match="a device or pipe"):
         Replay(Path("/dev/null"), TOOLS)
 
 
-def test_a_run_that_was_killed_is_read_up_to_its_last_whole_line(tmp_path):
+def test_killed_run_is_read_up_to_its_last_complete_line(tmp_path):
     last = line(3)
     for end in range(len(last)):
         assert numbers(log(tmp_path, line(1), line(2), last[:end])) == [1, 2]
     assert numbers(log(tmp_path, line(1), line(2), last)) == [1, 2, 3]
 
 
-def test_a_line_that_a_full_disk_cut_is_left_out(tmp_path):
+def test_line_truncated_by_a_full_disk_is_skipped(tmp_path):
     assert numbers(log(tmp_path, line(1), line(2)[:40], line(3), "")) == [1, 3]
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_a_log_that_windows_copied(tmp_path, encoding):
+def test_log_with_windows_line_ends_is_read(tmp_path, encoding):
     path = tmp_path / "run.jsonl"
     path.write_bytes("\r\n".join([line(1), line(2), ""]).encode(encoding))
     assert numbers(path) == [1, 2]
 
 
-def test_the_port_status_is_replayed(tmp_path):
+def test_port_status_is_replayed(tmp_path):
     log(tmp_path, line(1, port_status=[49, 49, 113]), line(2))
     replay = Replay(tmp_path, TOOLS, lambda: 0.0, lambda seconds: None)
     assert replay.read().port_status == (49, 49, 113)
 
 
-def test_the_command_ends_with_69(tmp_path, model_file):
+def test_replay_without_frames_exits_with_69(tmp_path, model_file):
     log(tmp_path, '{"frame": 7}')
     command = [Path(sys.executable).with_name("modsoft-runtime"), "--robot", "pneumatic-2", "--model", model_file]
     done = subprocess.run(

@@ -27,7 +27,7 @@ def settled(start_s=100.0):
     return validator
 
 
-def test_a_good_frame_gives_its_configuration():
+def test_good_frame_gives_its_configuration():
     check = FrameValidator(ROBOT).check(frame(1, 100.0, (3.0, 30.0, -40.0)), 100.02)
     assert check.good
     assert check.age_s == pytest.approx(0.02)
@@ -158,7 +158,7 @@ def test_confirming_frames_are_in_a_row_and_within_the_gate_of_each_other(betwee
         assert not validator.check(frame(6000 + 24 * step, now_s, angles, valid=valid), now_s + 0.02).good
 
 
-def test_a_gap_allows_no_larger_jump():
+def test_gap_allows_no_larger_jump():
     """The command is held without a valid frame, so that the robot does not move any further."""
     validator = settled()
     now_s = 100.0 + 3 * PERIOD_S
@@ -173,7 +173,7 @@ def test_no_limits_in_the_robot_file_give_a_gate():
     assert validator.check(frame(6024, 100.4, (0.0, 0.0, 90.0)), 100.42).status == safety.JUMP
 
 
-def test_a_robot_as_fast_as_its_limits_allow_is_no_jump():
+def test_robot_as_fast_as_its_limits_allow_is_no_jump():
     """The largest actuation step, over a reach of 90 degrees to each side, with half of it again as swing."""
     validator = settled()
     angle, sign = 0.0, 1.0
@@ -186,7 +186,7 @@ def test_a_robot_as_fast_as_its_limits_allow_is_no_jump():
         assert check.good, check
 
 
-def test_a_frozen_tracker_is_found_within_three_ticks_whatever_the_phase():
+def test_frozen_tracker_is_found_within_three_ticks_whatever_the_phase():
     for phase_s in np.linspace(0.0, PERIOD_S, 9):
         validator, held = settled(), frame(6000 + round(60 * phase_s), 100.0 + phase_s)
         statuses = [validator.check(held, 100.0 + phase_s + 0.01 + k * PERIOD_S).status for k in range(3)]
@@ -194,7 +194,7 @@ def test_a_frozen_tracker_is_found_within_three_ticks_whatever_the_phase():
         assert statuses[2] != "good"
 
 
-def test_a_delay_is_found_although_the_host_sees_fresh_frames():
+def test_delay_is_detected_in_fresh_frames():
     validator = FrameValidator(ROBOT)
     for step in range(10):
         now_s = 100.0 + step * PERIOD_S
@@ -292,7 +292,7 @@ def test_rest():
 @pytest.mark.parametrize(
     ("order", "module"), [((0, 2, 1, 3), 2), ((0, 1, 3, 2), 3), ((0, 3, 2, 1), 2), ((0, 3, 1, 2), 2), ((0, 2, 3, 1), 3)]
 )
-def test_a_straight_robot_with_its_tools_in_a_wrong_order_is_not_at_rest(order, module):
+def test_straight_robot_with_its_tools_in_a_wrong_order_is_not_at_rest(order, module):
     """Every module of it looks straight, and a controller would bend the wrong ones."""
     poses = planar_poses((1.0, -2.0, 3.0))
     with pytest.raises(Tripped, match=f"the tool of module {module} hangs .* mm behind that of module {module - 1}"):

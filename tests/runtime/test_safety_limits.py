@@ -59,7 +59,7 @@ def test_device_of_unknown_rate_has_no_delay(age_s):
 
 
 @pytest.mark.parametrize(("delayed_until_s", "status"), [(60.0, safety.DELAYED), (60.5, "good")])
-def test_promptest_frame_is_forgotten_after_a_minute(delayed_until_s, status):
+def test_shortest_delay_expires_after_a_minute(delayed_until_s, status):
     """Half a second of delay, at the limit, is the norm after it."""
     validator = settled(with_limits(tracker_age_s=0.5), device_hz=4.0)
     for at_s in np.arange(1.0, delayed_until_s + 0.25, 0.25):

@@ -14,7 +14,7 @@ CODES = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129}
 NUMBERS = {getattr(signal, name): code for name, code in CODES.items() if hasattr(signal, name)}
 
 
-def test_the_first_request_wins():
+def test_first_request_wins():
     stop = Stop()
     stop.check()
     stop.request(StopKey("first"))
@@ -32,7 +32,7 @@ def test_exit_codes_of_signals(number, code):
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_before_the_run_a_signal_raises_where_the_program_is(number):
+def test_signal_before_the_run_raises_at_once(number):
     def interrupted():
         with Signals(Stop()):
             signal.raise_signal(number)
@@ -45,7 +45,7 @@ def test_before_the_run_a_signal_raises_where_the_program_is(number):
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_in_the_run_a_signal_only_asks(number):
+def test_signal_in_the_run_only_requests_the_stop(number):
     stop, left = Stop(), []
     with Signals(stop, left.append) as signals:
         signals.hold()
@@ -83,7 +83,7 @@ def test_closed_stream_has_no_status_line():
         pass
 
 
-def test_status_line_is_written_over(monkeypatch):
+def test_status_line_is_overwritten(monkeypatch):
     shown, stream, written = ["one"], Terminal(), threading.Event()
     real = stream.write
     monkeypatch.setattr(stream, "write", lambda text: real(text) and written.set())
@@ -99,7 +99,7 @@ def test_no_status_line_without_a_terminal():
     assert stream.getvalue() == ""
 
 
-def test_a_halted_terminal_does_not_halt_the_run():
+def test_halted_terminal_does_not_halt_the_run():
     class Halted(Terminal):
         def write(self, text):
             threading.Event().wait(30)
@@ -115,7 +115,7 @@ def test_a_halted_terminal_does_not_halt_the_run():
         assert shown.wait(10)
 
 
-def test_a_terminal_that_is_gone_is_no_error():
+def test_closed_terminal_is_no_error():
     class Gone(Terminal):
         def write(self, text):
             raise OSError("gone")

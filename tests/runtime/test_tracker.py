@@ -33,7 +33,7 @@ def test_latest_holds_the_newest_and_counts_the_rest():
     assert latest.counts == {"received": 3, "repeated": 1, "backwards": 1}
 
 
-def test_a_repeated_frame_does_not_become_younger():
+def test_repeated_frame_keeps_its_time():
     latest = LatestFrame()
     latest.put(frame(5, at_s=1.0))
     latest.put(frame(5, at_s=2.0))
@@ -41,7 +41,7 @@ def test_a_repeated_frame_does_not_become_younger():
 
 
 @given(st.lists(st.integers(0, 20)))
-def test_the_latest_never_goes_back(numbers):
+def test_latest_never_goes_back(numbers):
     latest = LatestFrame()
     seen = []
     for number in numbers:
@@ -191,7 +191,7 @@ def test_missing_device_is_named(tmp_path):
         open_source(ROBOT, "/dev/null", tools)
 
 
-def test_the_missing_extra_is_named(tmp_path, monkeypatch):
+def test_missing_extra_is_named(tmp_path, monkeypatch):
     import sys
 
     tools = [tmp_path / f"{n}.rom" for n in range(4)]

@@ -48,7 +48,7 @@ class Warmed(World):
         return self.warm_answer()
 
 
-def test_it_runs_shortly_before_a_step_and_no_step_is_late():
+def test_warm_up_runs_shortly_before_a_step_and_delays_none():
     world = Warmed(steps=10).run()
     assert len(world.runs) == RUNS * 10  # before all steps but the first, and before the end
     before_s = [min(due - at for due in map(world.due_s, range(11)) if due > at) for at in world.runs]
@@ -57,7 +57,7 @@ def test_it_runs_shortly_before_a_step_and_no_step_is_late():
     assert max(record.late_ms for record in world.ticks) < 1e-3
 
 
-def test_nothing_that_is_sent_or_logged_differs():
+def test_warm_up_changes_nothing_sent_or_logged():
     plainly, warmed = World(steps=8), Warmed(steps=8)
     for world in (plainly, warmed):
         hidden = corrupting(valid=np.array([True, True, False, True]))
@@ -73,7 +73,7 @@ def test_nothing_that_is_sent_or_logged_differs():
             assert encode(getattr(one, name)) == encode(getattr(other, name)), name
 
 
-def test_it_changes_neither_the_validator_nor_the_controller():
+def test_warm_up_changes_neither_validator_nor_controller():
     world = Warmed()
 
     def state():
@@ -91,7 +91,7 @@ def test_it_changes_neither_the_validator_nor_the_controller():
     [(0.02, PERIOD_S), (0.002, 0.05), (0.0, PERIOD_S)],
     ids=["slow computer", "short period", "coarse clock"],
 )
-def test_without_enough_time_it_never_runs(step_s, period_s):
+def test_warm_up_does_not_run_without_enough_time(step_s, period_s):
     table = ROBOT.to_dict()
     table["loop"] |= {"hz": 1.0 / period_s, "task": ""}
     world = Warmed(robot=robot_file.from_dict(table))
@@ -102,14 +102,14 @@ def test_without_enough_time_it_never_runs(step_s, period_s):
 
 
 @pytest.mark.parametrize("left_s", [MARGIN * 0.001 - 1e-5, 0.0005])
-def test_without_time_left_there_is_no_warm_up(left_s):
+def test_no_warm_up_without_time_left(left_s):
     world = Warmed()
     world.warm_up.step_took(0.001)
     assert world.warm_up.before(left_s, world.frame(), world.controller) == left_s
     assert world.runs == []
 
 
-def test_there_is_no_warm_up_before_the_first_step():
+def test_no_warm_up_before_the_first_step():
     world = Warmed()
     assert world.warm_up.before(0.003, world.frame(), world.controller) == 0.003
     assert world.runs == []
@@ -120,7 +120,7 @@ def fail():
 
 
 @pytest.mark.parametrize("answer", [fail, lambda: np.full((3, 1), np.nan)])
-def test_an_error_in_it_is_logged_once_and_the_run_goes_on(answer):
+def test_error_of_warm_up_is_logged_once_and_the_run_continues(answer):
     world = Warmed(answer=answer, steps=6).run()
     assert [record.sent for record in world.ticks] == [True] * 6
     [event] = [record for record in world.records if isinstance(record, WarmUpFailedRecord)]
@@ -128,7 +128,7 @@ def test_an_error_in_it_is_logged_once_and_the_run_goes_on(answer):
     assert len(world.runs) == 1
 
 
-def test_an_error_that_persists_ends_the_run_as_without_it():
+def test_persistent_error_ends_the_run_as_without_warm_up():
     """The step that cannot be computed is in the log, and the error is the model's own."""
     ends = []
     for world in (World(steps=6), Warmed(answer=lambda: np.full((3, 1), np.nan), steps=6)):
@@ -140,7 +140,7 @@ def test_an_error_that_persists_ends_the_run_as_without_it():
     assert ends[0] == ends[1]
 
 
-def test_a_run_that_takes_long_is_not_repeated():
+def test_long_warm_up_is_not_repeated():
     world = Warmed(steps=3)
     world.run_s = 0.003
     world.run()

@@ -20,7 +20,7 @@ def test_unprotected_reader_runs_the_attack(tmp_path, harm, evil):
 
 @pytest.mark.parametrize("zipped", [True, False])
 @pytest.mark.parametrize("place", ["robot", "weights", "extra"])
-def test_code_in_a_checkpoint_is_not_run(tmp_path, harm, evil, make_checkpoint, zipped, place, refused):
+def test_code_in_a_checkpoint_is_not_executed(tmp_path, harm, evil, make_checkpoint, zipped, place, refused):
     path = make_checkpoint(tmp_path / "model.pt")
     torch.save({**checkpoints.load(path), place: evil}, path, _use_new_zipfile_serialization=zipped)
     refused(checkpoints.load, path, "not a checkpoint of modsoft-train")

@@ -77,7 +77,7 @@ def test_folder_in_the_place_of_an_episode_is_refused(tmp_path, parts, name):
         collected(tmp_path / "d.h5")
 
 
-def test_pickled_episode_is_not_run(tmp_path, parts, harm, evil):
+def test_pickled_episode_is_not_executed(tmp_path, parts, harm, evil):
     np.savez(parts / "episode-000000.npz", configuration=np.array([evil]), action=np.zeros((10, 2, 1)), rejected=0)
     collected(tmp_path / "d.h5")
     assert not harm.exists()

@@ -74,7 +74,7 @@ def sources():
     return sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 
-def test_no_source_runs_what_it_reads_or_serves_the_network():
+def test_no_source_executes_its_input_or_listens_on_the_network():
     assert len(sources()) > 60
     lines = [line for path in sources() for line in violations(path.read_text(), str(path.relative_to(ROOT)))]
     assert lines == []

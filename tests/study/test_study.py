@@ -44,7 +44,7 @@ def test_study_writes_the_report_every_run_and_every_figure(shared_study):
         assert title in folder.report.read_text()
 
 
-def test_second_run_makes_nothing_again(study, run_evaluate):
+def test_second_run_repeats_no_stage(study, run_evaluate):
     before, first = modification_times(study), (study / "results.json").read_bytes()
     code, _, error = run_evaluate("study", "--quick", "--jobs", "2", "--out", study)
     assert code == 0, error
@@ -81,7 +81,7 @@ def test_model_with_other_settings_is_refused_in_one_line(study, run_evaluate):
     assert "Traceback" not in error
 
 
-def test_runs_of_a_changed_model_and_damaged_runs_are_made_again(study):
+def test_runs_of_a_changed_model_and_damaged_runs_are_repeated(study):
     folder = Folder(study)
     assert not rollouts.rollout_stage(PLAN, folder, 1).items
     shutil.copy(folder.onnx(LSTM), folder.onnx(MAIN))

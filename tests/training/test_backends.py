@@ -82,7 +82,7 @@ def straight(tmp_path) -> bytes:
     return (folder / "d.h5").read_bytes()
 
 
-def test_dask_survives_a_killed_worker_with_no_sample_lost(tmp_path, straight):
+def test_killed_dask_worker_loses_no_sample(tmp_path, straight):
     pytest.importorskip("distributed", reason="extra dask")
     collected(tmp_path, "d.h5", "dask", "die")
     assert (tmp_path / "died").exists()
@@ -174,7 +174,7 @@ def test_missing_dask_cluster_is_reported(tmp_path, options, error, message):
         first("dask", options, tmp_path)
 
 
-def test_an_array_is_no_longer_than_slurm_takes(tmp_path, monkeypatch):
+def test_job_array_has_at_most_the_size_that_slurm_accepts(tmp_path, monkeypatch):
     """With many batches each job gets several, in order, and none is lost."""
     submitit = pytest.importorskip("submitit", reason="extra slurm")
     seen = []
@@ -194,7 +194,7 @@ def test_an_array_is_no_longer_than_slurm_takes(tmp_path, monkeypatch):
         assert [batch for chunk in seen for batch in chunk] == batches
 
 
-def test_jobs_that_left_the_queue_are_found(tmp_path, monkeypatch):
+def test_jobs_that_left_the_queue_are_detected(tmp_path, monkeypatch):
     squeue = tmp_path / "squeue"
     squeue.write_text("#!/bin/sh\necho '7_0 RUNNING'\necho '7_2 PENDING'\n")
     squeue.chmod(0o755)

@@ -29,7 +29,7 @@ def data(tmp_path_factory):
     return path
 
 
-def test_all_ways_train_on_the_same_samples_until_the_target(bench, data):
+def test_all_methods_train_on_the_same_samples_until_the_target(bench, data):
     race = bench.Race(str(data), 300, 1, 16, iterations=40, batch=32, target_percent=40.0, seed=0, authors_check=20)
     result = bench.raced(race, minutes=4.0, turn_s=0.5)
     ways = result["ways"]

@@ -155,7 +155,7 @@ def test_pressures_follow_their_set_points_through_valve_and_chamber(pneumatic):
     assert np.abs(arm.pressures - set_points).max() < 1e-6
 
 
-def test_set_points_and_actuation_are_the_same_drive(pneumatic):
+def test_set_points_and_actuation_give_the_same_motion(pneumatic):
     """The rig sends pressures in slices of 20 ms, the data come from actuations over whole periods."""
     arm = pneumatic[2]
     action = np.array([[0.7], [-0.4]])
@@ -169,7 +169,7 @@ def test_set_points_and_actuation_are_the_same_drive(pneumatic):
     assert arm.configuration[0, 0] > 0.0 > arm.configuration[1, 0]  # side + bends towards +x
 
 
-def test_time_left_over_from_a_slice_is_owed_to_the_next(pneumatic):
+def test_remaining_time_of_a_slice_is_added_to_the_next(pneumatic):
     arm = pneumatic[2]
     action = np.array([[0.7], [-0.4]])
     arm.reset()
@@ -181,7 +181,7 @@ def test_time_left_over_from_a_slice_is_owed_to_the_next(pneumatic):
     assert np.abs(arm.configuration - whole).max() < 1e-12
 
 
-def test_reset_puts_back_every_bit(pneumatic):
+def test_reset_restores_every_bit(pneumatic):
     arm = pneumatic[3]
     actions = np.random.default_rng(6).uniform(-1.0, 1.0, (3, 3, 1))
     arm.reset()
@@ -200,7 +200,7 @@ def test_longer_pneumatic_robots_stay_bounded(modules):
     assert np.abs(bending_angle_deg(arm.configuration)).max() < 130.0
 
 
-def test_a_state_that_is_not_finite_is_one_clear_error(monkeypatch):
+def test_state_that_is_not_finite_is_one_line(monkeypatch):
     too_large = dataclasses.replace(CABLE, time_step_s=1e-3)
     monkeypatch.setitem(arm_module.PARAMETERS, "cable", too_large)
     arm = Arm("cable", 2)

@@ -91,7 +91,7 @@ def test_perturbed_robots_equal_pyelastica(kind, modules, periods, stiffness, pa
 
 
 @needs_kernel
-def test_softer_module_bends_further_and_the_others_hardly_change():
+def test_softer_module_bends_further_and_the_others_change_little():
     """Nearly at rest the couple of the cables is the same."""
     drawn = np.broadcast_to([[0.3, 0.0]] * 3, (20, 1, 3, 2))
     stiff, soft = (
@@ -156,7 +156,7 @@ def test_exponential_damping_stays_close_to_the_recorded_runs(recorded):
 
 @needs_kernel
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
-def test_numbers_do_not_depend_on_the_other_robots(kind):
+def test_results_are_independent_of_the_other_robots(kind):
     drawn = actions(kind, 2, 19, 3, seed=1)
     together = configurations(Fleet(kind, 3, 19), drawn)
     assert np.array_equal(together[:, 5:6], configurations(Fleet(kind, 3, 1), drawn[:, 5:6]))

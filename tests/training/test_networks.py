@@ -62,7 +62,7 @@ def test_lstm_gets_all_modules_slot_by_slot():
     torch.testing.assert_close(network(x), expected)
 
 
-def test_module_lstm_depends_on_its_own_module_and_shares_no_weight():
+def test_module_lstm_uses_only_its_module_and_shares_no_weight():
     network = made("module-lstm")
     x, _, _ = windows()
     depends = heard(network, x)

@@ -42,7 +42,7 @@ def test_motion_of_the_robot_has_no_oracle_error(modules):
     assert np.abs(errors(desired, found.actions) - found.errors).max() < 1e-9
 
 
-def test_the_first_error_is_that_of_the_robot_at_rest():
+def test_first_error_is_that_of_the_robot_at_rest():
     """The configuration at the start of step 0 is before any action."""
     found = oracle_error("cable", 2, motion(steps=6)[2:])
     at_rest = 100.0 * np.linalg.norm(motion(steps=6)[2] - [0.0, 0.0, 1.0], axis=-1)
@@ -58,7 +58,7 @@ def test_beyond_reach_the_actuation_saturates_and_the_other_module_stays():
     assert found.errors[1:, 0].mean() < 1.0
 
 
-def test_the_same_seed_gives_the_same_actions():
+def test_same_seed_gives_the_same_actions():
     first, second = (oracle_error("cable", 2, beyond_reach(4), seed=3) for _ in range(2))
     assert isinstance(first, OracleResult)
     assert np.array_equal(first.actions, second.actions)

@@ -155,7 +155,7 @@ def test_correction_removes_a_constant_error_of_the_policy():
     assert r.angle_errors_deg(corrected.configuration, desired)[20:].max() < 0.1
 
 
-def test_angle_error_is_the_shorter_of_the_two_ways():
+def test_angle_error_wraps_at_180_degrees():
     configuration = from_angles_deg(np.array([[170.0]]))
     desired = from_angles_deg(np.array([[-170.0]]))
     np.testing.assert_allclose(r.angle_errors_deg(configuration, desired), [[20.0]])

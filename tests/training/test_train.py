@@ -40,7 +40,7 @@ def equal(one: dict, other: dict) -> bool:
     return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_the_network_learns_and_the_checkpoint_describes_the_run(tmp_path):
+def test_network_learns_and_the_checkpoint_describes_the_run(tmp_path):
     out = tmp_path / "model.pt"
     data = make(20)
     reports = []
