@@ -138,7 +138,7 @@ class Work:
 
     def keep(self, result: Result) -> None:
         """Writes a result, whole or not at all."""
-        content = {"test": result.test.node, **result._asdict()}
+        content = {**result._asdict(), "test": result.test.node}
         with written(self.folder / result.test.file_name) as new:
             new.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 

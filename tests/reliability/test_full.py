@@ -201,6 +201,7 @@ def test_damaged_result_is_refused(full, tmp_path):
     result = full.Result(test, 1.0, 0, [])
     work.keep(result)
     assert work.result(test) == result
+    assert json.loads((tmp_path / "work" / test.file_name).read_text())["test"] == test.node
     (tmp_path / "work" / test.file_name).write_text(json.dumps({"seconds": 1}))
     with pytest.raises(Exception, match="found no result of a test"):
         work.result(test)
