@@ -137,6 +137,26 @@ ROWS: dict[int, Row] = {
         "no crash, no wrong configuration",
         "10^4 replies in tests, 10^5 on demand: 0 and 0; a run that the limits allow continues",
     ),
+    40: Row(
+        "pins float after opening the port (reset, bootloader)", "pull-downs vent", "down in 250 ms with pull-downs"
+    ),
+    41: Row("pins float after a watchdog reset", "pull-downs vent", "down in 250 ms with pull-downs"),
+    42: Row("board without power", "pull-downs vent; vented when power returns", "down in 250 ms with pull-downs"),
+    43: Row(
+        "PC without power",
+        "a board with its own supply vents at the slew limit; one powered by USB needs pull-downs",
+        "all 0 in 700 ms; down in 250 ms with pull-downs",
+    ),
+    44: Row("scale or offset of the sensors differs from the robot file", "not armed", "one line; A0 to A11 measured"),
+    45: Row("sensor wire broken (0.5-4.5 V)", "fault, ramp vent", "vent begins in 130 ms"),
+    46: Row("supply of the board below 4.5 V", "fault, ramp vent", "all 0 in 400 ms"),
+    47: Row("chamber under pressure before arming", "ARM refused", "one line with channel and pressure"),
+    48: Row("a check is skipped", "watchdog", "each check"),
+    49: Row(
+        "bootloader resets repeatedly after a watchdog reset",
+        "pull-downs vent; the host names the cause",
+        "down in 250 ms with pull-downs; back after power off",
+    ),
 }
 
 CLOCKS = {"emulated": "board's cycles", "virtual": "injected", "host": "wall", "none": ""}

@@ -297,5 +297,6 @@ class Board:
         after = f" after {resets} resets" if resets else ""
         raise DeviceAbsent(
             f"no board found at {self.name}{after} ({what}); "
-            f"give another port, or flash the firmware (make -C firmware flash PORT={self.name})"
+            f"give another port, or flash the firmware (make -C firmware flash PORT={self.name}); if it stopped "
+            "during a run, its bootloader may reset repeatedly: remove its power and see docs/hardware.md"
         )

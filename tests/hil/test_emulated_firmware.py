@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import re
-import shutil
-import subprocess
 import time
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from modsoft.hil.board import toolchain
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
-from modsoft.hil.board.toolchain import FIRMWARE, FIRMWARE_ELF
 from modsoft.hil.outputs import read_outputs
 
 pytestmark = pytest.mark.realtime
@@ -73,49 +67,3 @@ def test_noise_on_the_line_is_counted_by_both_ends(board_name: str, drive: Any) 
             pass
         assert status["rx_bad"] > 20
     assert 40 < board.summary["rx_corrupted"] < 120
-
-
-CHECKS = [
-    (name, line)
-    for name in ("supervisor.c", "firmware.ino")
-    for line in re.findall(r"^ +(?:uint8_t )?checks \|?= \w+\(.*;$", (FIRMWARE / name).read_text(), re.MULTILINE)
-]
-
-
-@pytest.fixture(scope="module")
-def firmware_copy(simavr: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the firmware and its objects, to be compiled with one change."""
-    toolchain.build("simavr")
-    folder = tmp_path_factory.mktemp("checks")
-    shutil.copytree(FIRMWARE, folder / "firmware")
-    shutil.copytree(FIRMWARE_ELF.parent, folder / "built")
-    return folder
-
-
-def resets_with(folder: Path, name: str, old: str, new: str) -> list[str]:
-    """Causes of the resets in half a second of the board's time, with this change of a source file."""
-    source = folder / "firmware" / name
-    original = source.read_text()
-    source.write_text(original.replace(old, new))
-    make = ("make", "-s", "-C", str(source.parent), "OUT=../built", "OURS=-w")
-    subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
-    source.write_text(original)
-    elf = folder / "built" / FIRMWARE_ELF.name
-    with EmulatedBoard("simavr", firmware=elf, bootloader=False, stepped=True) as board:
-        board.run(500_000, 0)
-        return [event["cause"] for event in board.trace if event["event"] == "reset"]
-
-
-def test_every_check_is_listed_and_all_of_them_feed_the_watchdog(firmware_copy: Path) -> None:
-    assert len(CHECKS) == 8
-    assert resets_with(firmware_copy, "supervisor.c", "", "") == ["power-on"]
-
-
-def test_disabled_converter_stops_the_watchdog_feed(firmware_copy: Path) -> None:
-    assert "_BV(ADEN) | " in (FIRMWARE / "sensors.c").read_text()
-    assert "watchdog" in resets_with(firmware_copy, "sensors.c", "_BV(ADEN) | ", "")
-
-
-@pytest.mark.parametrize(("name", "line"), CHECKS, ids=[re.search(r"= (\w+)", line)[1] for _, line in CHECKS])
-def test_missing_check_stops_the_watchdog_feed(firmware_copy: Path, name: str, line: str) -> None:
-    assert "watchdog" in resets_with(firmware_copy, name, line, re.sub("= .*;", "= 0;", line))

@@ -97,8 +97,7 @@ static void enter_reset(const char *cause) {
 }
 
 static void leave_reset(void) {
-  bool power_on = !strcmp(reset_cause, "power-on");
-  uint8_t flags = power_on ? 0 : flags_before;
+  uint8_t flags = flags_before;
   bool watchdog_on = !strcmp(reset_cause, "watchdog") || flags & 1 << WDRF; /* it stays on while WDRF is set */
   for (avr_io_t *io = avr->io_port; io; io = io->next) {
     if (!strcmp(io->kind, "watchdog") && watchdog_on) {
@@ -110,8 +109,6 @@ static void leave_reset(void) {
   avr_reset(avr);
   if (!strcmp(reset_cause, "external")) {
     avr->data[MCUSR] |= 1 << EXTRF;
-  } else if (power_on) {
-    avr->data[MCUSR] |= 1 << PORF;
   }
   avr->data[MCUSR] |= flags;
   flags_before = avr->data[MCUSR];
@@ -136,6 +133,7 @@ void board_power_cycle(void) {
       avr->data[address] = harness_random();
     }
   }
+  flags_before = 1 << PORF;
   enter_reset("power-on");
 }
 
