@@ -5,6 +5,7 @@
 #include <stdbool.h>
 
 #include "frame.h"
+#include "limits.h"
 
 #define MAGIC 0x6d736674UL
 #define STARVED_MS 100 /* less than the 120 ms of the watchdog, whose clock may run fast */
@@ -14,11 +15,12 @@ static struct {
   uint32_t magic;
   uint32_t id;
   uint32_t fed_ms;
-  uint8_t noise[24];
+  uint16_t supply_mv;
+  uint8_t noise[22];
 } memory __attribute__((section(".noinit")));
 static uint8_t flags_at_reset __attribute__((section(".noinit")));
 static uint32_t millis_at_reset __attribute__((section(".noinit")));
-static bool survived, starved;
+static bool survived, starved, sagged;
 
 extern volatile unsigned long timer0_millis; /* the counter of the core's millis() */
 
@@ -35,9 +37,11 @@ void boot_early(void) {
 uint32_t boot_next_id(void) {
   survived = memory.magic == MAGIC;
   starved = millis_at_reset - memory.fed_ms >= STARVED_MS;
+  sagged = memory.supply_mv < SUPPLY_LEAST_MV;
   memory.id = survived ? memory.id + 1 : frame_crc32((const uint8_t *)&memory, sizeof memory);
   memory.magic = MAGIC;
   memory.fed_ms = 0;
+  memory.supply_mv = SUPPLY_LEAST_MV;
   return memory.id;
 }
 
@@ -59,10 +63,14 @@ uint8_t boot_reset_cause(void) {
   if (!survived) {
     return RESET_CAUSE_POWER_ON;
   }
-  return starved ? RESET_CAUSE_WATCHDOG : RESET_CAUSE_EXTERNAL;
+  if (starved) {
+    return RESET_CAUSE_WATCHDOG;
+  }
+  return sagged ? RESET_CAUSE_BROWN_OUT : RESET_CAUSE_EXTERNAL; /* the supply was low just before */
 }
 
-void boot_feed_watchdog(uint32_t now_ms) {
+void boot_feed_watchdog(uint32_t now_ms, uint16_t supply_mv) {
   memory.fed_ms = now_ms;
+  memory.supply_mv = supply_mv;
   wdt_reset();
 }

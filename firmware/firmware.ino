@@ -53,7 +53,7 @@ void loop() {
     checks |= supervisor_update(&board, inputs.measured, inputs.supply_mv, now_ms);
     checks |= drive_pins();
     if (checks == CHECK_ALL) {
-      boot_feed_watchdog(now_ms);
+      boot_feed_watchdog(now_ms, inputs.supply_mv);
     }
   }
   // Never waits for the host to read. A few bytes at a time, because every byte sent starts a pass that adds more.

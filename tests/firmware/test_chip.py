@@ -261,15 +261,25 @@ def test_the_flags_of_the_chip_give_the_cause(chip, flags, cause):
 @pytest.mark.parametrize(("hung_ms", "cause"), [(99, ResetCause.EXTERNAL), (100, ResetCause.WATCHDOG)])
 def test_clock_shows_a_watchdog_reset_after_the_bootloader(chip, hung_ms, cause):
     chip.boot()
-    chip.code.boot_feed_watchdog(5000)
+    chip.code.boot_feed_watchdog(5000, 5000)
     chip.millis.value = 5000 + hung_ms
     assert chip.boot()[1] == cause
     chip.millis.value = 0
     assert chip.boot()[1] == ResetCause.EXTERNAL, "the last feeding of the previous run counts"
 
 
+@pytest.mark.parametrize(("supply_mv", "cause"), [(4499, ResetCause.BROWN_OUT), (4500, ResetCause.EXTERNAL)])
+def test_behind_the_bootloader_a_low_supply_shows_a_brown_out(chip, supply_mv, cause):
+    chip.boot()
+    chip.code.boot_feed_watchdog(5000, supply_mv)
+    chip.millis.value = 5001
+    assert chip.boot()[1] == cause
+    chip.millis.value = 0
+    assert chip.boot()[1] == ResetCause.EXTERNAL, "the supply of the previous run counts"
+
+
 def test_watchdog_is_off_until_setup_and_fed_by_feeding(chip):
     chip.boot()
     assert chip.watchdog_is_on.value == 0
-    chip.code.boot_feed_watchdog(1)
+    chip.code.boot_feed_watchdog(1, 5000)
     assert chip.watchdog_resets.value == 1
