@@ -44,6 +44,7 @@ class BoardRecord(msgspec.Struct, frozen=True, eq=False):
     applied_bar: Array  # (channels,) pressures that the board commands to the valves
     measured_bar: Array  # (channels,) pressures at the sensors; NaN where there is no sensor
     age_ms: float  # since the status arrived
+    supply_v: float | None = None  # supply of the board; None in logs before firmware version 2
 
 
 class Acknowledgement(msgspec.Struct, frozen=True):

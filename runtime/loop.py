@@ -201,6 +201,7 @@ class Loop:
             self.valves.applied_bar,
             self.valves.measured_bar,
             self.valves.status_age_s * 1e3,
+            status.supply_mv * 1e-3,
         )
 
 

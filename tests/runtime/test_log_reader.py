@@ -25,7 +25,7 @@ from modsoft.runtime.log_record import (
 )
 
 FRAME = FrameRecord(7, 10**9, np.tile(np.eye(4), (4, 1, 1)), np.array([1, 1, 0, 1], bool), np.array([0.1] * 4), 1.5)
-BOARD = BoardRecord("RUNNING", 0, 3, np.full(12, 0.1), np.array([0.1] * 6 + [np.nan] * 6), 50.0)
+BOARD = BoardRecord("RUNNING", 0, 3, np.full(12, 0.1), np.array([0.1] * 6 + [np.nan] * 6), 50.0, 4.98)
 BAR = np.array([0.1] * 6 + [0.0] * 6)
 
 # A run of release 0.1.0, with two modules and two channels.

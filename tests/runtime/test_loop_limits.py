@@ -95,6 +95,7 @@ def test_records_have_times_in_milliseconds():
     assert [record.late_ms for record in world.ticks] == pytest.approx([0.0, 0.0, 50.0, 0.0], abs=1e-6)
     assert [record.step_ms for record in world.ticks] == pytest.approx([1.0] * 4)
     assert [record.board.age_ms for record in world.ticks] == pytest.approx([50.0] * 4)
+    assert [record.board.supply_v for record in world.ticks] == pytest.approx([4.98] * 4)
 
 
 def test_warm_up_gets_the_time_left_and_the_duration_of_each_step():

@@ -82,7 +82,7 @@ class World:
         self.acknowledging = True
         self.lost = None
         # the board
-        self.status = SimpleNamespace(acked_seq=0, state=State.ARMED, faults=0, tick=0)
+        self.status = SimpleNamespace(acked_seq=0, state=State.ARMED, faults=0, tick=0, supply_mv=4980)
         self.status_age_s = 0.05
         self.ack_latency_s = None
         self.applied_bar = np.zeros(CHANNELS)
