@@ -75,8 +75,8 @@
 /* After a lost link a ramp from P_MAX must end 670 ms after the last frame; the loop takes up to 40 ms of that. */
 _Static_assert(LINK_TIMEOUT_MS + 1000UL * P_MAX / SLEW <= 630, "SLEW is too slow to vent in time");
 _Static_assert(0 < P_MIN && P_MIN < P_MAX && P_OVER < P_FULL, "limits out of order: P_MIN < P_MAX < P_OVER < P_FULL");
-_Static_assert(0 <= SENSOR_ZERO_MV && SENSOR_ZERO_MV + 900L <= SENSOR_FULL_MV && SENSOR_FULL_MV <= 5000,
-               "range of a sensor: at least 900 mV, from 0 to 5 V");
+_Static_assert(0 <= SENSOR_ZERO_MV && SENSOR_ZERO_MV + 1000L <= SENSOR_FULL_MV && SENSOR_FULL_MV <= 5000,
+               "range of a sensor: at least 1000 mV, from 0 to 5 V");
 _Static_assert(P_OVER < SENSOR_FULL && SENSOR_FULL <= 100000,
                "the sensors cannot see an over-pressure, or above 10 bar");
 _Static_assert(1000 <= REFERENCE_MV && REFERENCE_MV <= 1200, "the chip's reference is 1.0 to 1.2 V");

@@ -34,7 +34,7 @@ KINDS: dict[str, Kind] = {
     "pneumatic": Kind(("v_x", "v_y"), ("a_0",), ((1.0,), (-1.0,))),
 }
 
-LEAST_SENSOR_SPAN_V = 0.9  # as in firmware/limits.h
+LEAST_SENSOR_SPAN_V = 1.0  # as in firmware/limits.h
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)]
 Bar = Annotated[float, Meta(ge=0.0, le=10.0)]

@@ -143,10 +143,9 @@ def native() -> Path:
     return ROOT / "build" / "firmware"
 
 
-@pytest.fixture(scope="session")
-def sanitised(native: Path) -> ctypes.CDLL:
+def load(path: Path) -> ctypes.CDLL:
     """The firmware with the sanitiser of undefined behaviour, which ends the test run at the first finding."""
-    library = ctypes.CDLL(str(native / "libsupervisor.so"))
+    library = ctypes.CDLL(str(path))
     library.board_new.restype = ctypes.c_void_p
     for function in (library.board_faults, library.supervisor_counts, library.board_rx_bad):
         function.restype = ctypes.c_uint16
@@ -156,6 +155,19 @@ def sanitised(native: Path) -> ctypes.CDLL:
         function.restype = ctypes.c_uint8
     library.frame_crc32.restype = ctypes.c_uint32
     return library
+
+
+@pytest.fixture(scope="session")
+def sanitised(native: Path) -> ctypes.CDLL:
+    return load(native / "libsupervisor.so")
+
+
+@pytest.fixture
+def board45(native: Path) -> Iterator[NativeBoard]:
+    """A board for sensors of 0.5 to 4.5 V, 2 bar."""
+    board = NativeBoard(load(native / "libsupervisor45.so"))
+    yield board
+    board.free()
 
 
 @pytest.fixture

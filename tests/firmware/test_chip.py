@@ -204,6 +204,21 @@ def test_pressure_of_a_sensor_with_an_offset(sensor45, millivolt, units):
     assert abs(sensors.measured[0] - units) <= 25  # half a step of the converter, a whole one at its end
 
 
+def test_pressures_beyond_the_protocol_are_limited(native, tmp_path):
+    """0.5 to 1.5 V for 10 bar: the largest pressure of the protocol is 3.2767 bar."""
+    if not (native / "libsensor15.so").exists():
+        pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
+    chip = Chip(shutil.copy(native / "libsensor15.so", tmp_path))
+    sensors = begin(chip)
+    for _ in range(2):
+        convert(chip, sensors, 225)
+    for reading in (1023, 0, 169, 168, 42, 43):
+        convert(chip, sensors, reading)
+    exact = [(reading * 5000 / 1024 - 500) * 100000 / 1000 for reading in (169, 168, 42, 43)]
+    assert list(sensors.measured)[:2] == [32767, -32767]
+    assert list(sensors.measured)[2:6] == pytest.approx(exact, abs=0.6)
+
+
 def test_inputs_8_to_11_are_selected_by_the_sixth_bit(sensor45):
     sensors = begin(sensor45)
     assert (sensor45.registers[DIDR0], sensor45.registers[DIDR2]) == (0x01, 0x09)

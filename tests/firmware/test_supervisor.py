@@ -711,3 +711,13 @@ def test_lowest_allowed_supply_is_no_fault(running):
     running.supply_mv = 4499
     running.wait(99)
     assert running.faults == Fault(0)
+
+
+@pytest.mark.parametrize(("units", "faulty"), [(-1251, True), (-1250, False), (21250, False), (21251, True)])
+def test_range_of_sensors_with_an_offset(board45, units, faulty):
+    """Below 0.25 V and above 4.75 V the wire is broken."""
+    (hello,) = [frame.message for frame in board45.messages()]
+    assert (hello.sensor_zero_mv, hello.sensor_full_mv, hello.sensor_full) == (500, 4500, 20000)
+    board45.measured[0] = units
+    board45.wait(101)
+    assert (Fault.SENSOR in board45.faults) == faulty

@@ -101,7 +101,7 @@ PNEUMATIC = robot_file.text_of("pneumatic-3")
         ),
         (PNEUMATIC.replace("full_scale_bar = 3.0", "full_scale_bar = 0.3"), "p_min_bar < p_max_bar <= full_scale_bar"),
         (PNEUMATIC.replace("p_min_bar = 0.08", "p_min_bar = 0.5"), "p_min_bar < p_max_bar"),
-        (PNEUMATIC.replace("zero_v = 0.0", "zero_v = 4.2"), "full_v at least 0.9 V above zero_v"),
+        (PNEUMATIC.replace("zero_v = 0.0", "zero_v = 4.2"), "full_v at least 1.0 V above zero_v"),
         (PNEUMATIC.replace("full_v = 5.0", "full_v = 10.0"), r"full_v under \[sensors\]: found 10.0; .* at most 5$"),
         (PNEUMATIC.replace("channel = 5", "channel = 4"), "channel 4 is used by two chambers"),
         (
