@@ -283,7 +283,11 @@ def full_matrix(work: Path | None, rows: str | None, out: Path) -> int:
 
 
 @click.command("reliability", help=__doc__, context_settings={"show_default": True})
-@click.option("--full", is_flag=True, help="The numbers of tries of the matrix; takes hours, and can be interrupted.")
+@click.option(
+    "--full",
+    is_flag=True,
+    help="The numbers of tries of the matrix: an estimated two to three hours on two cores. It can be interrupted.",
+)
 @click.option("--rows", help="With --full: only the tests of these rows, such as 31-39,45.  [default: all]")
 @click.option(
     "--work",

@@ -160,6 +160,8 @@ class _Process:
             stdout=self._output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
+            # A background job of a shell ignores SIGINT, and its children would inherit that.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
 
     def result(self) -> Result:
@@ -171,9 +173,12 @@ class _Process:
         lines = [json.loads(line) for line in Path(self._lines.name).read_text(encoding="utf-8").splitlines()]
         return Result(self.test, round(seconds, 1), code, lines)
 
-    def stop(self) -> None:
+    def interrupt(self) -> None:
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
+
+    def stop(self) -> None:
+        if self.process.poll() is None:
             try:
                 self.process.wait(STOP_TIMEOUT_S)
             except subprocess.TimeoutExpired:
@@ -197,6 +202,8 @@ def run_tests(
                 running.remove(process)
                 finished(process.result())
     finally:
+        for process in running:
+            process.interrupt()
         for process in running:
             process.stop()
 

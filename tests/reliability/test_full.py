@@ -97,17 +97,30 @@ def test_finished_tests_are_skipped_and_their_lines_kept(full, checkout, known_t
     assert ran == ["test_row_06_cable", "test_rows_08_09_reset"]
 
 
-def test_interrupted_test_leaves_no_result_and_no_process(checkout, tmp_path):
-    command = "import sys, reliability_full as full; from pathlib import Path\n"
-    command += "tests = [full.MatrixTest('tests/reliability/test_rows.py::test_rows_08_09_reset', True)]\n"
-    command += "full.collect = lambda root: tests\nfull.run(Path(sys.argv[1]), Path(sys.argv[2]), {8}, print)"
+def ignore_interrupt():
+    """As a shell does for a job in the background."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@pytest.mark.parametrize(("number", "prepare"), [(signal.SIGINT, None), (signal.SIGTERM, ignore_interrupt)])
+def test_interrupted_test_leaves_no_result_and_no_process(number, prepare, checkout, tmp_path):
+    command = (
+        "import sys, click, reliability_full as full; from pathlib import Path\n"
+        "from modsoft.runtime.entry_point import entry\n"
+        "root, work = map(Path, sys.argv[1:])\n"
+        "tests = [full.MatrixTest('tests/reliability/test_rows.py::test_rows_08_09_reset', True)]\n"
+        "full.collect = lambda root: tests\n"
+        "sys.argv[1:] = []\n"
+        "entry(click.command('x')(lambda: full.run(root, work, {8}, print)))()\n"
+    )
     environment = {**os.environ, "PYTHONPATH": str(TOOLS), "DELAY_S": "60"}
     arguments = [sys.executable, "-c", command, checkout, tmp_path / "work"]
-    with subprocess.Popen(arguments, env=environment, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+    options = {"env": environment, "stderr": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
+    with subprocess.Popen(arguments, **options, preexec_fn=prepare) as process:
         while not (checkout / "started").exists():
             assert process.poll() is None
             time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         process.wait(20)
     assert [path.name for path in (tmp_path / "work").iterdir()] == ["commit"]
     left = subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True, text=True, check=False).stdout
