@@ -61,15 +61,15 @@ def settings_for(kind: str, options: dict[str, Any]) -> Settings:
     `options` have the names of the fields of `Settings`; device "auto" is cuda where there is a GPU. Raises
     `UsageError` for a device or precision that this machine does not have.
     """
-    given = {name: value for name, value in options.items() if value is not None}
-    if given.get("device", "auto") == "auto":
-        given["device"] = "cuda" if torch.cuda.is_available() else "cpu"
+    changed = {name: value for name, value in options.items() if value is not None}
+    if changed.get("device", "auto") == "auto":
+        changed["device"] = "cuda" if torch.cuda.is_available() else "cpu"
     defaults = dict(BY_KIND[kind])
-    if given.get("network", "bilstm") != "bilstm":
+    if changed.get("network", "bilstm") != "bilstm":
         defaults["truncation_probability"] = 0.0
-    if given["device"] == "cuda":
+    if changed["device"] == "cuda":
         defaults["batch"] *= CUDA_BATCHES
-    settings = Settings(**{**defaults, **given})
+    settings = Settings(**{**defaults, **changed})
     check_machine(settings)
     return settings
 

@@ -292,9 +292,9 @@ def test_quaternion_gives_the_rotation_back(values):
     )
     pose = np.eye(4)
     pose[:3, :3] = rotation
-    found = np.array(quaternion(pose.tolist()))
-    assert found[0] >= 0
-    assert abs(found @ [w, x, y, z]) == pytest.approx(1.0, abs=1e-12)
+    result = np.array(quaternion(pose.tolist()))
+    assert result[0] >= 0
+    assert abs(result @ [w, x, y, z]) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_file_in_the_place_of_the_port_stays(tmp_path):

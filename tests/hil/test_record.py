@@ -17,8 +17,8 @@ OPENED = {"event": "pwm", "t_us": 1e3, "mono_ns": 1_000_000, "channel": 0, "duty
 
 def test_lateness_is_that_of_the_run():
     late = [{"event": "late", "late_us": us, "mono_ns": ns} for us, ns in ((90e3, 0), (30e3, 2e9), (25e3, 3e9))]
-    found = record._board_lateness(late, {"max_late_us": 90e3}, start_ns=1e9, end_ns=int(11e9))
-    assert found == {"board_late_ms": 30.0, "board_slipped_percent": pytest.approx(0.55)}
+    lateness = record._board_lateness(late, {"max_late_us": 90e3}, start_ns=1e9, end_ns=int(11e9))
+    assert lateness == {"board_late_ms": 30.0, "board_slipped_percent": pytest.approx(0.55)}
     assert record._board_lateness([], {"max_late_us": 7e3}, 1e9, int(11e9))["board_late_ms"] == 7.0
     assert math.isnan(record._board_lateness([], {}, 1e9, int(11e9))["board_late_ms"])
 
@@ -51,21 +51,21 @@ def run_folder(tmp_path):
 
 
 def test_first_tick_that_sent_nothing_is_a_failed_run_with_a_report(run_folder, tmp_path):
-    found = run_folder()
-    np.testing.assert_array_equal(found.commanded_bar[:, 5:7], [[0.08, 0], [0.2, 0]])
-    assert found.missed == 1
-    assert found.runtime_message == "too late"
-    assessment = criteria.assess(found)
+    run_record = run_folder()
+    np.testing.assert_array_equal(run_record.commanded_bar[:, 5:7], [[0.08, 0], [0.2, 0]])
+    assert run_record.missed == 1
+    assert run_record.runtime_message == "too late"
+    assessment = criteria.assess(run_record)
     assert assessment.outcome == "failed"
-    report.write(found, assessment, {"board": "native"}, tmp_path)
+    report.write(run_record, assessment, {"board": "native"}, tmp_path)
     assert "too late" in (tmp_path / "report.md").read_text()
 
 
 def test_run_without_a_first_set_point_has_none(run_folder):
-    found = run_folder(start=False)
-    assert found.start_ns is None
-    assert not found.commanded_bar[0].any()
-    assert criteria.assess(found).outcome == "failed"
+    run_record = run_folder(start=False)
+    assert run_record.start_ns is None
+    assert not run_record.commanded_bar[0].any()
+    assert criteria.assess(run_record).outcome == "failed"
 
 
 @pytest.mark.parametrize(("board", "expected"), [(5000, 0.5), (20000, 2.0), (30000, 2.0), (None, 2.0)])

@@ -57,22 +57,22 @@ def wait_until(true, timeout_s):
 
 def run(folder, robot, model, steps):
     """The record of a short run, which meets every criterion but its length."""
-    wanted = folder / "down.npy"  # a random controller is not held to the limits of a task's name
+    task_file = folder / "down.npy"  # a random controller is not held to the limits of a task's name
     reference = load_task("down", robot_file.load(robot))[:steps]
-    np.save(wanted, reference)
+    np.save(task_file, reference)
     with Rig(robot, folder) as rig:
-        rig.run(model, str(wanted))
+        rig.run(model, str(task_file))
         rig.wait(60)
         rig.settle(1.5)
-    return record.read(folder, rig.run_folder(), rig.robot, wanted.name, reference, rig.runtime.returncode)
+    return record.read(folder, rig.run_folder(), rig.robot, task_file.name, reference, rig.runtime.returncode)
 
 
-def as_in_collection(found, run_folder):
+def as_in_collection(recorded, run_folder):
     """Configurations at the ticks (K, N, 3) of the robot that training data comes from, given what the run applied."""
     from modsoft.training.simulation.elastica import Arm
 
-    arm = Arm(found.robot.kind, found.robot.modules)
-    arm.step(np.zeros((found.robot.modules, 1)))  # the period before the first tick
+    arm = Arm(recorded.robot.kind, recorded.robot.modules)
+    arm.step(np.zeros((recorded.robot.modules, 1)))  # the period before the first tick
     there = []
     for tick in read(run_folder).ticks:
         there.append(arm.configuration)
@@ -83,14 +83,16 @@ def as_in_collection(found, run_folder):
 @pytest.mark.realtime
 @pytest.mark.parametrize("robot", ["pneumatic-3", "pneumatic-2"])
 def test_model_of_three_modules_runs_robots_of_three_and_two(robot, strong_model, tmp_path):
-    found = run(tmp_path, robot, strong_model, steps=20)
-    assessment = criteria.assess(found)
+    recorded = run(tmp_path, robot, strong_model, steps=20)
+    assessment = criteria.assess(recorded)
     table = "\n".join(f"{line.met}  {line.name}: {line.measured} ({line.limit})" for line in assessment.criteria)
     print(table)
     assert assessment.outcome == "inconclusive", table
     if "too slow" not in assessment.reason:
         assert all(line.met for line in assessment.criteria), table
-        off = angle_between_deg(found.configuration, as_in_collection(found, next(tmp_path.glob("runtime-log-*/*"))))
+        off = angle_between_deg(
+            recorded.configuration, as_in_collection(recorded, next(tmp_path.glob("runtime-log-*/*")))
+        )
         print(f"off the robot of the training data, same actuation: mean {off.mean():.3f}, max {off.max():.2f}°")
         assert off.mean() < 0.3, "the rig's robot is not the one that the controller was trained on"
 

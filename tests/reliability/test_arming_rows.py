@@ -42,10 +42,10 @@ def refusals(port):
                 heartbeat_s, tick = heartbeat_s + 0.1, tick + 1
                 port.write(encode(Heartbeat(tick), 0, 0))
             heard.extend(frame.message for frame in parser.feed(port.read(256)))
-            found = [message for message in heard if isinstance(message, kind)]
-            if found:
+            matching = [message for message in heard if isinstance(message, kind)]
+            if matching:
                 heard.clear()
-                return found[0]
+                return matching[0]
         return None
 
     def answer(message):

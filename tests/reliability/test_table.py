@@ -32,7 +32,7 @@ def line(row, **values):
     return {**shown, "clock": "emulated", "met": True, "why": "", "test": f"test_{row}", **values}
 
 
-def made(folder, *lines):
+def run_tool(folder, *lines):
     """Runs the command on these lines; returns (exit code, its output, the page)."""
     kept, page = folder / "lines.jsonl", folder / "page.md"
     kept.write_text("".join(json.dumps(each) + "\n" for each in lines))
@@ -51,20 +51,20 @@ def test_every_row_of_the_matrix_has_its_test():
 
 
 def test_complete_matrix_has_every_row_met(tmp_path):
-    code, output, page = made(tmp_path, *map(line, ALL))
+    code, output, page = run_tool(tmp_path, *map(line, ALL))
     assert (code, "49 of 49 rows are met." in output) == (0, True)
     assert page.count("| 484 ms | board's cycles | yes |") == 49
 
 
 def test_row_without_a_line_is_missing(tmp_path):
-    code, output, page = made(tmp_path, *(line(row) for row in ALL if row not in (7, 30)))
+    code, output, page = run_tool(tmp_path, *(line(row) for row in ALL if row not in (7, 30)))
     assert (code, "47 of 49 rows are met. Missing: 7, 30." in output) == (1, True)
     assert page.count("**missing**") == 2
 
 
 def test_row_with_an_unmet_line_is_unmet(tmp_path):
     lines = [*map(line, ALL), line(30, fault="emulated", worst="2.2 ms", met=False, why="one long pass")]
-    code, output, page = made(tmp_path, *lines)
+    code, output, page = run_tool(tmp_path, *lines)
     assert (code, "48 of 49 rows are met. Not met: 30." in output) == (1, True)
     assert "| 2.2 ms | board's cycles | **no**: one long pass |" in page
 
@@ -76,7 +76,7 @@ def test_repeated_line_replaces_the_first(tmp_path, reliability):
 
 
 def test_invalid_line_is_refused(tmp_path):
-    code, output, page = made(tmp_path, line(1), {"row": 2})
+    code, output, page = run_tool(tmp_path, line(1), {"row": 2})
     assert (code, page) == (65, "")
     assert "line 2 has no fault" in output
 

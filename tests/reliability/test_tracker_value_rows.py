@@ -38,8 +38,8 @@ def statuses(hz, seconds, rng, delay_s=lambda at_s: 0.0):
 def test_row_35_other_frame_rates(matrix_row, full):
     rng, minutes, alarms, ticks = np.random.default_rng(35), 60 if full else 3, 0, 0
     for hz in RATES_HZ:
-        found = [status for _, status in statuses(hz, 60.0 * minutes, rng)]
-        alarms, ticks = alarms + len(found) - found.count("good"), ticks + len(found)
+        checked = [status for _, status in statuses(hz, 60.0 * minutes, rng)]
+        alarms, ticks = alarms + len(checked) - checked.count("good"), ticks + len(checked)
     matrix_row(
         35,
         fault=f"none: frame rates of {RATES_HZ[0]:g} to {RATES_HZ[-1]:g} Hz, learned",
@@ -51,9 +51,10 @@ def test_row_35_other_frame_rates(matrix_row, full):
     assert alarms == 0
     slowest_s, tries = 0.0, 0
     for hz, from_s in itertools.product(RATES_HZ, rng.uniform(500.0, 590.0, 10 if full else 2)):
-        found = statuses(hz, from_s - 500.0 + 20.0, rng, lambda at_s, from_s=from_s: 0.6 if at_s > from_s else 0.0)
-        assert all(status == "good" for at_s, status in found if at_s < from_s)
-        late = [(at_s, status) for at_s, status in found if at_s > from_s + 0.6]  # the device counts on after its pause
+        checked = statuses(hz, from_s - 500.0 + 20.0, rng, lambda at_s, from_s=from_s: 0.6 if at_s > from_s else 0.0)
+        assert all(status == "good" for at_s, status in checked if at_s < from_s)
+        # The device continues counting after its pause.
+        late = [(at_s, status) for at_s, status in checked if at_s > from_s + 0.6]
         slowest_s = max([slowest_s, *(at_s - from_s for at_s, status in late if status == "good")])
         tries += 1
     matrix_row(

@@ -94,10 +94,10 @@ def test_idle_is_called_at_least_every_slice_and_may_raise():
     time = Time()
     ticker = time.ticker()
     ticker.next()
-    asked = []
-    ticker.next(lambda: asked.append(time.time_s))
-    assert len(asked) >= 0.4 / SLICE_S
-    assert max(b - a for a, b in itertools.pairwise(asked)) <= SLICE_S + 1e-9
+    idle_times_s = []
+    ticker.next(lambda: idle_times_s.append(time.time_s))
+    assert len(idle_times_s) >= 0.4 / SLICE_S
+    assert max(b - a for a, b in itertools.pairwise(idle_times_s)) <= SLICE_S + 1e-9
 
     def stop():
         raise KeyboardInterrupt

@@ -95,10 +95,10 @@ def test_reader_keeps_the_error_that_ended_it():
 def test_reader_continues_after_a_read_without_a_frame():
     class Failing(Scripted):
         def read(self):
-            found = super().read()
-            if found is not None and found.device_frame == 2:
+            latest = super().read()
+            if latest is not None and latest.device_frame == 2:
                 raise FrameError("wrong checksum")
-            return found
+            return latest
 
     source, latest = Failing([frame(1), frame(2)]), LatestFrame()
     reader = Reader(source, latest)

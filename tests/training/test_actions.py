@@ -45,8 +45,8 @@ def test_actions_are_within_the_limits_of_the_control_loop(modules, largest, str
 
 def shares(values: np.ndarray) -> np.ndarray:
     """Of each tenth of the range."""
-    found, _ = np.histogram(values, bins=10, range=(-1, 1))
-    return found / values.size
+    counts, _ = np.histogram(values, bins=10, range=(-1, 1))
+    return counts / values.size
 
 
 def test_unbounded_actions_are_uniform():
@@ -67,9 +67,9 @@ def test_bounded_actions_cover_the_range_in_a_data_set_of_the_usual_size():
     robot = of_modules("pneumatic", 3, 0.4)
     drawn = np.stack([draw(robot, "staged", 300, seed) for seed in range(50)])
     for module in range(3):
-        found = shares(drawn[:, :, module])
-        assert found.min() > 0.04  # the ends of the range; 0.059 was seen
-        assert found.max() < 0.2  # around rest, where every episode begins; 0.171 was seen
+        fractions = shares(drawn[:, :, module])
+        assert fractions.min() > 0.04  # the ends of the range; 0.059 was seen
+        assert fractions.max() < 0.2  # around rest, where every episode begins; 0.171 was seen
 
 
 def test_random_actions_differ_between_modules_and_change_slowly_and_fast():
@@ -89,9 +89,9 @@ def test_smooth_actions_cover_the_whole_range_with_jitter(strategy):
     steps = np.abs(np.diff(drawn, axis=1))
     assert np.median(steps) < 0.1  # 0.59 where every action is independent
     for module in range(4):
-        found = shares(drawn[:, :, module])
-        assert found.min() > 0.02
-        assert found[[0, -1]].min() > 0.025  # the ends of the range, where the workspace ends; 0.035 was seen
+        fractions = shares(drawn[:, :, module])
+        assert fractions.min() > 0.02
+        assert fractions[[0, -1]].min() > 0.025  # the ends of the range, where the workspace ends; 0.035 was seen
     begins_at_rest = np.abs(drawn[:, 0]).max(axis=(1, 2)) < 0.35
     assert 0.05 < np.mean(begins_at_rest) < 0.95  # the others jump
 

@@ -47,9 +47,9 @@ STAND_IN = """
         rng = np.random.default_rng(np.random.SeedSequence(3, spawn_key=(2, 0)))
         actions = draw_actions(robot, "staged", 30, rng)
         simulator = Simulator("stand-in", StandIn(mode, actions, Path("died").absolute()), 2)
-        given = dict(option.split("=") for option in options)
-        made = collect(robot, Path(out), 360, "staged", 3, 30, 2, simulator, backend=backend, options=given)
-        print("made", made.samples)
+        backend_options = dict(option.split("=") for option in options)
+        header = collect(robot, Path(out), 360, "staged", 3, 30, 2, simulator, backend=backend, options=backend_options)
+        print("made", header.samples)
 """
 
 
@@ -60,7 +60,7 @@ def collected(folder: Path, *arguments: str, expect: int = 0) -> subprocess.Comp
         "import sys, stand_in\nif __name__ == '__main__':\n    stand_in.main(*sys.argv[1:])\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(folder)}
-    found = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "script.py", *arguments],
         cwd=folder,
         env=environment,
@@ -69,8 +69,8 @@ def collected(folder: Path, *arguments: str, expect: int = 0) -> subprocess.Comp
         timeout=120,
         check=False,
     )
-    assert found.returncode == expect, found.stderr
-    return found
+    assert result.returncode == expect, result.stderr
+    return result
 
 
 @pytest.fixture

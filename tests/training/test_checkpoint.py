@@ -31,14 +31,14 @@ def test_damaged_file_never_gives_other_values(tmp_path, make_checkpoint):
     for _ in range(300):
         path.write_bytes(corrupted(sound, generator))
         try:
-            found = checkpoints.load(path)
+            loaded = checkpoints.load(path)
         except ModelError:
             refused += 1
             continue
-        weights, wanted = found.pop("weights"), dict(expected["weights"])
-        assert found == {name: value for name, value in expected.items() if name != "weights"}
-        assert weights.keys() == wanted.keys()
-        assert all(torch.equal(weights[name], wanted[name]) for name in wanted)
+        weights, expected_weights = loaded.pop("weights"), dict(expected["weights"])
+        assert loaded == {name: value for name, value in expected.items() if name != "weights"}
+        assert weights.keys() == expected_weights.keys()
+        assert all(torch.equal(weights[name], expected_weights[name]) for name in expected_weights)
     assert refused > 250
 
 

@@ -34,9 +34,9 @@ def installed() -> None:
         pytest.skip("SLURM is not installed, and there is no apt-get to install it")
     quiet = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     for arguments in (["update", "-qq"], ["install", "-y", "-qq", "--no-install-recommends", *PACKAGES]):
-        found = subprocess.run(["apt-get", *arguments], env=quiet, capture_output=True, text=True, check=False)
-    if found.returncode != 0:
-        pytest.skip(f"SLURM cannot be installed: {(found.stderr.strip().splitlines() or ['no reason given'])[-1]}")
+        result = subprocess.run(["apt-get", *arguments], env=quiet, capture_output=True, text=True, check=False)
+    if result.returncode != 0:
+        pytest.skip(f"SLURM cannot be installed: {(result.stderr.strip().splitlines() or ['no reason given'])[-1]}")
 
 
 def free_port() -> int:
@@ -107,9 +107,9 @@ PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
                 running.append(subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT))
             if command[0] == "munged":
                 eventually(munge.exists, "munged answers", among=tuple(running))
-        asked = ["sinfo", "--noheader", "--format=%T"]
+        command = ["sinfo", "--noheader", "--format=%T"]
         eventually(
-            lambda: subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip() == "idle",
+            lambda: subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() == "idle",
             "the node is idle",
             among=tuple(running),
         )
@@ -125,17 +125,17 @@ PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 
 
 def command(out: str, *arguments: str, samples: int = 9600) -> list[str]:
-    asked = ["--robot", "pneumatic-2", "--samples", str(samples), "--steps", "200", "--seed", "6", "--jobs", "2"]
-    return [sys.executable, "-m", "modsoft.training.collect_cli", *asked, "--out", out, *arguments]
+    options = ["--robot", "pneumatic-2", "--samples", str(samples), "--steps", "200", "--seed", "6", "--jobs", "2"]
+    return [sys.executable, "-m", "modsoft.training.collect_cli", *options, "--out", out, *arguments]
 
 
-def run(folder: Path, *arguments: str, **given) -> subprocess.CompletedProcess:
-    return subprocess.run(command(*arguments, **given), cwd=folder, capture_output=True, text=True, check=False)
+def run(folder: Path, *arguments: str, **settings) -> subprocess.CompletedProcess:
+    return subprocess.run(command(*arguments, **settings), cwd=folder, capture_output=True, text=True, check=False)
 
 
 def queued() -> list[str]:
-    asked = ["squeue", "--noheader", "--array", "--format=%F_%K %T"]
-    return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.splitlines()
+    command = ["squeue", "--noheader", "--array", "--format=%F_%K %T"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
 
 
 def running_jobs() -> list[str]:
@@ -144,8 +144,8 @@ def running_jobs() -> list[str]:
 
 @pytest.fixture
 def straight(tmp_path) -> bytes:
-    found = run(tmp_path, "straight.h5")
-    assert found.returncode == 0, found.stderr
+    result = run(tmp_path, "straight.h5")
+    assert result.returncode == 0, result.stderr
     data = tmp_path / "straight.h5"
     content = data.read_bytes()
     data.unlink()
@@ -153,23 +153,23 @@ def straight(tmp_path) -> bytes:
 
 
 def test_jobs_make_the_same_data_set(slurm, tmp_path, straight):
-    found = run(tmp_path, "d.h5", "--backend", "submitit", "--backend-option", "slurm_partition=all")
-    assert found.returncode == 0, found.stderr
+    result = run(tmp_path, "d.h5", "--backend", "submitit", "--backend-option", "slurm_partition=all")
+    assert result.returncode == 0, result.stderr
     assert (tmp_path / "d.h5").read_bytes() == straight
     assert [path.name for path in tmp_path.iterdir()] == ["d.h5"]
-    asked = ["scontrol", "show", "job", "--oneliner"]
-    shown = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
+    command = ["scontrol", "show", "job", "--oneliner"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert shown.count("JobState=COMPLETED") == 6  # 48 episodes, eight at a time
     assert "Partition=all" in shown
-    assert "sacct" not in found.stderr  # which cannot work here, and would say so in the middle of the progress
+    assert "sacct" not in result.stderr  # which cannot work here, and would say so in the middle of the progress
 
 
 def test_killed_collection_resumes_from_the_episodes_of_its_jobs(slurm, tmp_path):
     """SIGKILL to modsoft-collect, which leaves its jobs in the queue, and another start while they run."""
-    given = {"samples": 96000}
-    assert run(tmp_path, "straight.h5", **given).returncode == 0
+    settings = {"samples": 96000}
+    assert run(tmp_path, "straight.h5", **settings).returncode == 0
     victim = subprocess.Popen(
-        command("d.h5", "--backend", "submitit", **given), cwd=tmp_path, stderr=subprocess.DEVNULL
+        command("d.h5", "--backend", "submitit", **settings), cwd=tmp_path, stderr=subprocess.DEVNULL
     )
     parts = tmp_path / "d.h5.parts"
     eventually(lambda: any(parts.glob("episode-*.npz")), "an episode is there", among=(victim,))
@@ -178,7 +178,7 @@ def test_killed_collection_resumes_from_the_episodes_of_its_jobs(slurm, tmp_path
     assert queued()
     kept = len(list(parts.glob("episode-*.npz")))
     assert 0 < kept < 480
-    again = run(tmp_path, "d.h5", "--backend", "submitit", **given)
+    again = run(tmp_path, "d.h5", "--backend", "submitit", **settings)
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "d.h5").read_bytes() == (tmp_path / "straight.h5").read_bytes()
     eventually(lambda: not queued(), "the queue is empty")
@@ -186,10 +186,10 @@ def test_killed_collection_resumes_from_the_episodes_of_its_jobs(slurm, tmp_path
 
 
 def test_cancelled_job_is_reported_and_the_next_run_resumes(slurm, tmp_path):
-    given = {"samples": 96000}
-    assert run(tmp_path, "straight.h5", **given).returncode == 0
+    settings = {"samples": 96000}
+    assert run(tmp_path, "straight.h5", **settings).returncode == 0
     collecting = subprocess.Popen(
-        command("d.h5", "--backend", "submitit", **given), cwd=tmp_path, stderr=subprocess.PIPE, text=True
+        command("d.h5", "--backend", "submitit", **settings), cwd=tmp_path, stderr=subprocess.PIPE, text=True
     )
     eventually(running_jobs, "a job runs", among=(collecting,))
     lost = running_jobs()[0]
@@ -198,7 +198,7 @@ def test_cancelled_job_is_reported_and_the_next_run_resumes(slurm, tmp_path):
     assert collecting.returncode == 70
     assert f"job {lost} was lost" in message
     eventually(lambda: not queued(), "its other jobs are cancelled too")
-    again = run(tmp_path, "d.h5", "--backend", "submitit", **given)
+    again = run(tmp_path, "d.h5", "--backend", "submitit", **settings)
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "d.h5").read_bytes() == (tmp_path / "straight.h5").read_bytes()
 
@@ -206,8 +206,8 @@ def test_cancelled_job_is_reported_and_the_next_run_resumes(slurm, tmp_path):
 def test_dask_jobqueue_makes_the_same_data_set(slurm, tmp_path, straight):
     pytest.importorskip("dask_jobqueue", reason="extra dask")
     options = ("cluster=SLURMCluster", "cores=1", "memory=1GB", "interface=lo", 'job_directives_skip=["--mem"]')
-    asked = [word for option in options for word in ("--backend-option", option)]
-    found = run(tmp_path, "d.h5", "--backend", "dask", *asked)
-    assert found.returncode == 0, found.stderr
+    backend_options = [word for option in options for word in ("--backend-option", option)]
+    result = run(tmp_path, "d.h5", "--backend", "dask", *backend_options)
+    assert result.returncode == 0, result.stderr
     assert (tmp_path / "d.h5").read_bytes() == straight
     eventually(lambda: not queued(), "its workers have left")

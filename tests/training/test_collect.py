@@ -55,13 +55,13 @@ def test_data_set_contains_its_generation_settings(tmp_path):
     robot = of_modules("pneumatic", 3, 0.4)
     out = tmp_path / "d.h5"
     seen = []
-    made = c.collect(robot, out, 100, "staged", 3, 30, simulator=simulator(), progress=lambda *p: seen.append(p))
+    header = c.collect(robot, out, 100, "staged", 3, 30, simulator=simulator(), progress=lambda *p: seen.append(p))
     assert seen == [(0, 120), (30, 120), (60, 120), (90, 120), (120, 120)]
     assert list(tmp_path.iterdir()) == [out]
     data = dataset.read(out)
     assert data.robot == robot
-    assert made == dataset.Header(data.generation, made.stage_borders, 0, 4)
-    assert made.samples == data.samples == 120
+    assert header == dataset.Header(data.generation, header.stage_borders, 0, 4)
+    assert header.samples == data.samples == 120
     assert data.configuration.shape == (4, 31, 3, 3)
     assert data.action.shape == (4, 30, 3, 1)
     assert list(data.stage_borders) == [0, 10, 20, 30]
@@ -126,12 +126,12 @@ def parts_of_one_episode(tmp_path) -> Path:
 @pytest.mark.parametrize("finished", [False, True])
 def test_other_generation_settings_are_refused_and_nothing_changes(tmp_path, change, message, finished):
     out = parts_of_one_episode(tmp_path)
-    asked = {"robot": of_modules("pneumatic", 3, 0.4), "strategy": "staged", "seed": 1, "steps": 30}
+    arguments = {"robot": of_modules("pneumatic", 3, 0.4), "strategy": "staged", "seed": 1, "steps": 30}
     if finished:
-        c.collect(asked["robot"], out, 60, "staged", 1, 30, simulator=simulator())
+        c.collect(arguments["robot"], out, 60, "staged", 1, 30, simulator=simulator())
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     with pytest.raises(ModelError, match=message):
-        c.collect(out=out, samples=60, simulator=simulator(), **{**asked, **change})
+        c.collect(out=out, samples=60, simulator=simulator(), **{**arguments, **change})
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
 
@@ -285,11 +285,11 @@ def test_error_in_a_worker_ends_the_command_with_its_own_message(tmp_path):
         "    raise ModelError('no simulator')\n"
     )
     (tmp_path / "script.py").write_text(textwrap.dedent(SCRIPT))
-    found = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "script.py", "2", "0"], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
-    assert found.returncode != 0
-    assert "no simulator" in found.stderr
+    assert result.returncode != 0
+    assert "no simulator" in result.stderr
     assert not (tmp_path / "d.h5").exists()
     assert json.loads((tmp_path / "d.h5.parts" / "generation.json").read_text())["seed"] == 5
 
@@ -314,8 +314,8 @@ def test_memory_does_not_grow_with_the_number_of_samples(tmp_path):
     (tmp_path / "script.py").write_text(textwrap.dedent(MEMORY))
     for samples in (16_000, 160_000):
         command = [sys.executable, "script.py", str(samples)]
-        found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-        peaks_mib.append(float(found.stdout))
+        result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        peaks_mib.append(float(result.stdout))
         sizes_mib.append((tmp_path / "d.h5").stat().st_size / 2**20)
         (tmp_path / "d.h5").unlink()
     assert sizes_mib[1] - sizes_mib[0] > 20
@@ -325,14 +325,14 @@ def test_memory_does_not_grow_with_the_number_of_samples(tmp_path):
 def test_varied_data_have_another_perturbed_robot_every_eight_episodes():
     robot = robot_file.load("cable-4")
     generation = c.generation_settings(robot, "varied", 5, 30, "stand-in")
-    found = [c.perturbation_of(generation, robot, index) for index in range(400)]
-    assert len(set(found)) == 50
-    assert all(len(set(found[i : i + 8])) == 1 for i in range(0, 400, 8))
-    stiffness = np.array([each.stiffness for each in found])
+    perturbations = [c.perturbation_of(generation, robot, index) for index in range(400)]
+    assert len(set(perturbations)) == 50
+    assert all(len(set(perturbations[i : i + 8])) == 1 for i in range(0, 400, 8))
+    stiffness = np.array([each.stiffness for each in perturbations])
     assert stiffness.shape == (400, 4)
     assert 0.85 <= stiffness.min() < 0.9
     assert 1.1 < stiffness.max() <= 1.15
-    payloads = np.array([each.tip_payload_kg for each in found[::8]])
+    payloads = np.array([each.tip_payload_kg for each in perturbations[::8]])
     module_kg = 1050 * np.pi * 0.01**2 * 0.05
     assert 0.1 < np.mean(payloads == 0.0) < 0.5
     assert 2.5 * module_kg < payloads.max() < 4 * module_kg

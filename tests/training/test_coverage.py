@@ -72,11 +72,11 @@ def test_staged_data_cover_more_of_the_tips_space_than_random(tmp_path):
     files = [tmp_path / "staged.h5", tmp_path / "random.h5"]
     write(files[0], "cable-4", "staged", episodes=22)
     write(files[1], "cable-4", "random")
-    found = coverage.compare(files)
-    staged, random = (each.covered for each in found)
+    workspaces = coverage.compare(files)
+    staged, random = (each.covered for each in workspaces)
     assert staged.shape == (4,)
     assert staged[-1] > 1.1 * random[-1]
-    assert [len(each.positions) for each in found] == [3000, 3000]  # of the smaller
+    assert [len(each.positions) for each in workspaces] == [3000, 3000]  # of the smaller
 
 
 def test_data_sets_of_different_robots_are_refused(tmp_path):
@@ -90,21 +90,21 @@ def test_command_draws_and_prints(tmp_path):
     write(tmp_path / "s.h5", "pneumatic-3", "staged", 2)
     write(tmp_path / "r.h5", "pneumatic-3", "random", 2)
     command = [sys.executable, "-m", "modsoft.training.collect_cli", "plot", "s.h5", "r.h5", "--out", "w.png"]
-    found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stderr
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
     expected = coverage.compare([tmp_path / "s.h5"])[0].covered
     figures = ", ".join(f"{value:.4g}" for value in expected)
-    assert f"s.h5 (staged): modules 1 to 3 cover {figures} cm², 300 samples" in found.stdout
+    assert f"s.h5 (staged): modules 1 to 3 cover {figures} cm², 300 samples" in result.stdout
     assert (tmp_path / "w.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_picture_is_written_completely_or_not_at_all(tmp_path, monkeypatch):
     write(tmp_path / "s.h5", "pneumatic-3", "staged", 2)
-    found = coverage.compare([tmp_path / "s.h5"])
+    workspaces = coverage.compare([tmp_path / "s.h5"])
     for name, says in (("none/w.png", "no folder"), ("w.txt", "cannot be written"), ("w.tmp", "cannot be written")):
         with pytest.raises(UsageError, match=says):
-            coverage.draw(found, tmp_path / name)
-    coverage.draw(found, tmp_path / "w.svg")
+            coverage.draw(workspaces, tmp_path / name)
+    coverage.draw(workspaces, tmp_path / "w.svg")
     (tmp_path / "w.png").write_text("old")
 
     def full(figure, path, **options):
@@ -113,6 +113,6 @@ def test_picture_is_written_completely_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Figure, "savefig", full)
     with pytest.raises(OutputError, match=r"w\.png: cannot be written \(No space"):
-        coverage.draw(found, tmp_path / "w.png")
+        coverage.draw(workspaces, tmp_path / "w.png")
     assert (tmp_path / "w.png").read_text() == "old"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s.h5", "w.png", "w.svg"]

@@ -19,7 +19,7 @@ def described(name, **changes):
     return {"name": name, **sizes, **changes}
 
 
-def made(name, **changes):
+def built(name, **changes):
     torch.manual_seed(0)
     return networks.build(described(name, **changes)).eval()
 
@@ -34,22 +34,22 @@ def windows(count=3, modules=N, seed=0):
 def heard(network, x):
     """For each output (module, action) whether it depends on each feature: (N, F) booleans by output module."""
     x = x[:1].clone().requires_grad_()
-    found = []
+    dependencies = []
     for module in range(N):
         (slope,) = torch.autograd.grad(network(x)[0, module].sum(), x)
-        found.append(slope[0] != 0)
-    return torch.stack(found)  # (N out, N in, F)
+        dependencies.append(slope[0] != 0)
+    return torch.stack(dependencies)  # (N out, N in, F)
 
 
 def test_every_network_gives_the_actuation_of_every_module():
     x, _, _ = windows()
     for name in NETWORKS:
-        assert made(name)(x).shape == (3, N, A)
+        assert built(name)(x).shape == (3, N, A)
 
 
 def test_lstm_gets_all_modules_slot_by_slot():
     """Against a plain LSTM on the states and actions."""
-    network = made("lstm")
+    network = built("lstm")
     x, states, actions = windows()
     by_hand = torch.zeros(3, T, N * (S + A))
     for k in range(T):
@@ -63,7 +63,7 @@ def test_lstm_gets_all_modules_slot_by_slot():
 
 
 def test_module_lstm_uses_only_its_module_and_shares_no_weight():
-    network = made("module-lstm")
+    network = built("module-lstm")
     x, _, _ = windows()
     depends = heard(network, x)
     for module in range(N):
@@ -80,8 +80,8 @@ def test_module_lstm_uses_only_its_module_and_shares_no_weight():
 def test_bound_networks_do_not_use_the_label(name):
     x, _, _ = windows()
     assert feature_names("cable", T)[-1] == "label"
-    assert not heard(made(name), x)[..., -1].any()
-    assert heard(made("bilstm"), x)[..., -1].any()
+    assert not heard(built(name), x)[..., -1].any()
+    assert heard(built("bilstm"), x)[..., -1].any()
 
 
 @pytest.mark.parametrize("name", ["lstm", "module-lstm"])
@@ -89,8 +89,8 @@ def test_bound_networks_do_not_use_the_label(name):
 def test_bound_networks_refuse_another_number_of_modules(name, modules):
     x, _, _ = windows(modules=modules)
     with pytest.raises(ModelError, match=f"of {modules} modules.* trained for 4 modules"):
-        made(name)(x)
-    assert made("bilstm")(x).shape == (3, modules, A)
+        built(name)(x)
+    assert built("bilstm")(x).shape == (3, modules, A)
 
 
 def test_sizes_of_table_s1():
@@ -101,14 +101,14 @@ def test_sizes_of_table_s1():
         return sum(4 * hidden * (size + hidden + 2) for size in layers) + (hidden + 1) * head
 
     for name, expected in (("lstm", lstm(N * 5, 128, N * A)), ("module-lstm", N * lstm(5, 128, A))):
-        network = made(name, layers=4, hidden=128)
+        network = built(name, layers=4, hidden=128)
         assert sum(weight.numel() for weight in network.parameters()) == expected
 
 
 def test_dropout_is_between_layers_and_in_training_only():
     x, _, _ = windows()
     for name in NETWORKS:
-        network = made(name, dropout=0.5)
+        network = built(name, dropout=0.5)
         assert torch.equal(network(x), network(x))
         network.train()
         assert not torch.equal(network(x), network(x))

@@ -35,27 +35,27 @@ def beyond_reach(steps=6):
 @pytest.mark.parametrize("modules", [2, 4])
 def test_motion_of_the_robot_has_no_oracle_error(modules):
     desired = motion(modules)
-    found = oracle_error("cable", modules, desired)
-    assert found.actions.shape == (8, modules, 2)
-    assert found.errors.shape == (8, modules)
-    assert found.errors.max() < 2e-3
-    assert np.abs(errors(desired, found.actions) - found.errors).max() < 1e-9
+    result = oracle_error("cable", modules, desired)
+    assert result.actions.shape == (8, modules, 2)
+    assert result.errors.shape == (8, modules)
+    assert result.errors.max() < 2e-3
+    assert np.abs(errors(desired, result.actions) - result.errors).max() < 1e-9
 
 
 def test_first_error_is_that_of_the_robot_at_rest():
     """The configuration at the start of step 0 is before any action."""
-    found = oracle_error("cable", 2, motion(steps=6)[2:])
+    result = oracle_error("cable", 2, motion(steps=6)[2:])
     at_rest = 100.0 * np.linalg.norm(motion(steps=6)[2] - [0.0, 0.0, 1.0], axis=-1)
-    assert np.abs(found.errors[0] - at_rest).max() < 1e-9
-    assert found.errors[1:].max() < 2e-3
+    assert np.abs(result.errors[0] - at_rest).max() < 1e-9
+    assert result.errors[1:].max() < 2e-3
 
 
 def test_beyond_reach_the_actuation_saturates_and_the_other_module_stays():
-    found = oracle_error("cable", 2, beyond_reach())
-    assert (np.abs(found.actions) <= 1.0).all()
-    assert found.actions[:5, 1, 1].max() < -0.99
-    assert 20.0 < found.errors[1:, 1].mean() < 80.0
-    assert found.errors[1:, 0].mean() < 1.0
+    result = oracle_error("cable", 2, beyond_reach())
+    assert (np.abs(result.actions) <= 1.0).all()
+    assert result.actions[:5, 1, 1].max() < -0.99
+    assert 20.0 < result.errors[1:, 1].mean() < 80.0
+    assert result.errors[1:, 0].mean() < 1.0
 
 
 def test_same_seed_gives_the_same_actions():
@@ -90,7 +90,7 @@ def test_bounded_minimum_equals_that_of_scipy(seed):
     random = np.random.default_rng(seed)
     matrix, target = random.normal(size=(12, 6)), 3.0 * random.normal(size=12)
     lower, upper = -random.random(6), random.random(6)
-    found = oracle._bounded_minimum(sparse.csr_array(matrix.T @ matrix), -matrix.T @ target, lower, upper)
+    minimum = oracle._bounded_minimum(sparse.csr_array(matrix.T @ matrix), -matrix.T @ target, lower, upper)
     expected = lsq_linear(matrix, target, bounds=(lower, upper)).x
-    assert ((found >= lower) & (found <= upper)).all()
-    assert np.abs(found - expected).max() < 1e-4
+    assert ((minimum >= lower) & (minimum <= upper)).all()
+    assert np.abs(minimum - expected).max() < 1e-4

@@ -56,9 +56,9 @@ VALID = {
 @pytest.mark.parametrize("kind", VALID)
 def test_valid_data_sets_are_read_as_float64(tmp_path, kind):
     data = dataset.read(written(tmp_path / "own.h5", **VALID[kind]))
-    for found, expected in ((data.configuration, CONFIGURATION), (data.action, ACTION)):
-        assert found.dtype == np.dtype("=f8")
-        np.testing.assert_allclose(found, expected, atol=1e-3)
+    for values, expected in ((data.configuration, CONFIGURATION), (data.action, ACTION)):
+        assert values.dtype == np.dtype("=f8")
+        np.testing.assert_allclose(values, expected, atol=1e-3)
     assert data.generation["strategy"] == "real robot"
     assert sum(map(len, dataset.split(data, 2, "shuffled", 0))) == E * K
 

@@ -28,10 +28,10 @@ def draw(name: str, count: int, steps: int) -> tuple[robot_file.Robot, np.ndarra
 
 def test_elastica_starts_every_episode_from_rest():
     robot, actions = draw("pneumatic-2", 2, 6)
-    found = simulators.by_elastica(robot, actions)
-    assert found.shape == (2, 7, 2, 3)
-    assert np.all(np.isfinite(found))
-    np.testing.assert_array_equal(found[1], simulators.by_elastica(robot, actions[1:])[0])
+    configurations = simulators.by_elastica(robot, actions)
+    assert configurations.shape == (2, 7, 2, 3)
+    assert np.all(np.isfinite(configurations))
+    np.testing.assert_array_equal(configurations[1], simulators.by_elastica(robot, actions[1:])[0])
 
 
 def test_diverged_robot_of_elastica_is_nan_from_then_on(monkeypatch):
@@ -45,10 +45,10 @@ def test_diverged_robot_of_elastica_is_nan_from_then_on(monkeypatch):
     monkeypatch.setattr(elastica.Arm, "step", diverging)
     robot, actions = draw("pneumatic-2", 2, 4)
     actions[0, 2] = 0.75
-    found = simulators.by_elastica(robot, actions)
-    assert np.all(np.isfinite(found[0, :3]))
-    assert np.all(np.isnan(found[0, 3:]))
-    assert np.all(np.isfinite(found[1]))
+    configurations = simulators.by_elastica(robot, actions)
+    assert np.all(np.isfinite(configurations[0, :3]))
+    assert np.all(np.isnan(configurations[0, 3:]))
+    assert np.all(np.isfinite(configurations[1]))
 
 
 @needs_fleet
@@ -76,21 +76,21 @@ def test_diverged_robot_of_the_fleet_is_rejected_and_replaced(tmp_path, monkeypa
             self._state[victim // self.lanes, 2, 3, victim % self.lanes] = np.nan  # a velocity
 
     robot = robot_file.load("pneumatic-2")
-    made = {}
+    headers = {}
     for name in ("clean", "planted"):
         if name == "planted":
             monkeypatch.setattr(Fleet, "step", poisoned)
-        made[name] = collect.collect(robot, tmp_path / name, 8 * steps, "random", 2, steps)
-    clean, found = (dataset.read(tmp_path / name) for name in made)
+        headers[name] = collect.collect(robot, tmp_path / name, 8 * steps, "random", 2, steps)
+    clean, other = (dataset.read(tmp_path / name) for name in headers)
     assert len(planted) == 1
-    assert (made["clean"].rejected, made["planted"].rejected) == (0, 1)
-    assert np.isfinite(found.configuration).all()
+    assert (headers["clean"].rejected, headers["planted"].rejected) == (0, 1)
+    assert np.isfinite(other.configuration).all()
     others = [index for index in range(8) if index != victim]
-    np.testing.assert_array_equal(found.configuration[others], clean.configuration[others])
-    assert not np.array_equal(found.action[victim], clean.action[victim])
+    np.testing.assert_array_equal(other.configuration[others], clean.configuration[others])
+    assert not np.array_equal(other.action[victim], clean.action[victim])
     monkeypatch.undo()
-    again = simulators.by_fleet(robot, found.action[[victim]])
-    np.testing.assert_array_equal(again[0], found.configuration[victim])
+    again = simulators.by_fleet(robot, other.action[[victim]])
+    np.testing.assert_array_equal(again[0], other.configuration[victim])
 
 
 def test_simulators_are_selected_by_name():
@@ -164,10 +164,10 @@ def test_killed_collection_gives_the_same_file(tmp_path):
 def test_help_does_not_import_the_simulator(tmp_path):
     code = "import sys; from modsoft.training import collect_cli; assert not {'elastica', 'numba'} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-    found = subprocess.run(command("--help"), capture_output=True, text=True, check=False)
-    assert found.returncode == 0
+    result = subprocess.run(command("--help"), capture_output=True, text=True, check=False)
+    assert result.returncode == 0
     for option in ("--out", "--samples", "--strategy", "--seed", "--backend", "plot DATASET", "Example"):
-        assert option in found.stdout
+        assert option in result.stdout
 
 
 @pytest.mark.parametrize(
@@ -180,9 +180,9 @@ def test_help_does_not_import_the_simulator(tmp_path):
     ],
 )
 def test_wrong_arguments_are_refused(tmp_path, arguments, message):
-    found = subprocess.run(command(*arguments), cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert found.returncode == 2
-    assert message in found.stderr
+    result = subprocess.run(command(*arguments), cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert message in result.stderr
 
 
 @needs_fleet

@@ -48,19 +48,19 @@ def test_network_learns_and_the_checkpoint_describes_the_run(tmp_path):
         [data], out, dataclasses.replace(SMALL, iterations=600, learning_rate=0.01, dropout=0.0), reports.append
     )
     assert list(tmp_path.iterdir()) == [out]
-    found = checkpoints.load(out)
-    assert robot_file.from_dict(found["robot"]) == data.robot
-    assert found["features"] == feature_names("pneumatic", 3)
-    assert found["network"]["history"] == 3
-    assert found["provenance"]["data_sha256"] == data.sha256()
-    assert found["provenance"]["samples"] == 600
+    trained = checkpoints.load(out)
+    assert robot_file.from_dict(trained["robot"]) == data.robot
+    assert trained["features"] == feature_names("pneumatic", 3)
+    assert trained["network"]["history"] == 3
+    assert trained["provenance"]["data_sha256"] == data.sha256()
+    assert trained["provenance"]["samples"] == 600
     # Guessing 0 would be 25 percent of the range in the mean.
-    errors = found["provenance"]["errors_percent"]
-    assert len(errors) == len(found["provenance"]["errors_std_percent"]) == 3
+    errors = trained["provenance"]["errors_percent"]
+    assert len(errors) == len(trained["provenance"]["errors_std_percent"]) == 3
     assert max(errors) < 5.0
     # and they are those of the weights in the file, on the test part
     _, _, test = dataset.split(data, 3, "blocks", 0)
-    again = estimation_errors(checkpoints.network_of(found), test)
+    again = estimation_errors(checkpoints.network_of(trained), test)
     np.testing.assert_allclose(again.mean(dim=(0, 2)).numpy(), errors, atol=1e-3)
     assert [t.iteration for t in reports] == list(range(1, 601))
     assert reports[-1].progress == 1.0
@@ -110,29 +110,29 @@ def test_default_device_is_the_gpu_where_there_is_one(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert settings.settings_for("cable", {"device": "auto", "learning_rate": None}) == Settings(5, batch=64)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    found = settings.settings_for("pneumatic", {"device": "auto"})
-    assert (found.device, found.batch, found.truncation_probability) == ("cuda", 512, 0.4)
-    found = settings.settings_for("pneumatic", {"device": "cpu", "network": "lstm", "history": 7})
-    assert (found.device, found.batch, found.truncation_probability, found.history) == ("cpu", 128, 0.0, 7)
+    chosen = settings.settings_for("pneumatic", {"device": "auto"})
+    assert (chosen.device, chosen.batch, chosen.truncation_probability) == ("cuda", 512, 0.4)
+    chosen = settings.settings_for("pneumatic", {"device": "cpu", "network": "lstm", "history": 7})
+    assert (chosen.device, chosen.batch, chosen.truncation_probability, chosen.history) == ("cpu", 128, 0.0, 7)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_gpu_gives_the_same_model_within_rounding(tmp_path):
-    found = {}
+    trained = {}
     for device in DEVICES:
         changed = dataclasses.replace(SMALL, device=device, iterations=100, learning_rate=0.01)
-        found[device] = train.train([make(20)], tmp_path / f"{device}.pt", changed)["weights"]
-        assert {value.device.type for value in found[device].values()} == {"cpu"}
-    for name, value in found["cpu"].items():
-        torch.testing.assert_close(found["cuda"][name], value, atol=0.01, rtol=0.01)
+        trained[device] = train.train([make(20)], tmp_path / f"{device}.pt", changed)["weights"]
+        assert {value.device.type for value in trained[device].values()} == {"cpu"}
+    for name, value in trained["cpu"].items():
+        torch.testing.assert_close(trained["cuda"][name], value, atol=0.01, rtol=0.01)
 
 
 def test_run_ends_as_soon_as_its_target_is_reached(tmp_path):
     steps = []
     changed = dataclasses.replace(SMALL, iterations=600, learning_rate=0.01, target_percent=10.0)
-    found = train.train([make(20)], tmp_path / "model.pt", changed, steps.append)["provenance"]
-    assert found["validation_percent"] <= 10.0
-    assert found["iterations_done"] == len(steps) < 600
+    trained = train.train([make(20)], tmp_path / "model.pt", changed, steps.append)["provenance"]
+    assert trained["validation_percent"] <= 10.0
+    assert trained["iterations_done"] == len(steps) < 600
     assert steps[-1].validation_percent > 10.0, "the check after that step is the first that reaches it"
 
 
@@ -159,15 +159,15 @@ def test_interrupted_run_of_another_optimizer_is_refused(tmp_path, monkeypatch):
 def test_networks_bound_to_a_module_number_learn(tmp_path, network):
     data = make(20)
     changed = dataclasses.replace(SMALL, network=network, iterations=600, learning_rate=0.01, dropout=0.0)
-    found = train.train([data], tmp_path / "model.pt", changed)
-    assert (found["network"]["name"], found["network"]["modules"]) == (network, 3)
-    assert found["provenance"]["network"] == network
+    trained = train.train([data], tmp_path / "model.pt", changed)
+    assert (trained["network"]["name"], trained["network"]["modules"]) == (network, 3)
+    assert trained["provenance"]["network"] == network
     # A guess has 25 percent. A module's own angle does not show the up to 10 of 40 degrees from its neighbour.
-    assert max(found["provenance"]["errors_percent"]) < (5.0 if network == "lstm" else 15.0)
+    assert max(trained["provenance"]["errors_percent"]) < (5.0 if network == "lstm" else 15.0)
     again = checkpoints.network_of(checkpoints.load(tmp_path / "model.pt"))
     _, _, test = dataset.split(data, 3, "blocks", 0)
     errors = estimation_errors(again, test).mean(dim=(0, 2))
-    np.testing.assert_allclose(errors.numpy(), found["provenance"]["errors_percent"], atol=1e-3)
+    np.testing.assert_allclose(errors.numpy(), trained["provenance"]["errors_percent"], atol=1e-3)
 
 
 def test_network_bound_to_a_module_number_refuses_truncation():
@@ -256,12 +256,12 @@ def test_interrupted_run_ends_with_the_same_weights_bit_for_bit(tmp_path, iterat
     assert not out.exists()
     torch.manual_seed(123)  # a new process has another random state
     resumed = []
-    found = train.train([make()], out, changed, resumed.append)
+    trained = train.train([make()], out, changed, resumed.append)
     # From the last check: only the work since then is lost.
     every = changed.iterations // CHECKS
     assert resumed[0].iteration == (iteration - 1) // every * every + 1
-    assert equal(found["weights"], straight["weights"])
-    assert found["provenance"]["errors_percent"] == straight["provenance"]["errors_percent"]
+    assert equal(trained["weights"], straight["weights"])
+    assert trained["provenance"]["errors_percent"] == straight["provenance"]["errors_percent"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.pt", "straight.pt"]
 
 
@@ -309,13 +309,13 @@ def test_early_stopping_keeps_the_best_weights(tmp_path):
     data.action[:] = np.random.default_rng(5).uniform(-1, 1, data.action.shape)
     reports = []
     changed = dataclasses.replace(SMALL, iterations=4000, learning_rate=0.02, hidden=32, dropout=0.0)
-    found = train.train([data], tmp_path / "model.pt", changed, reports.append)
-    best = found["provenance"]["validation_percent"]
+    trained = train.train([data], tmp_path / "model.pt", changed, reports.append)
+    best = trained["provenance"]["validation_percent"]
     first_with_best = next(t.iteration for t in reports if t.validation_percent == best)
     every = changed.iterations // CHECKS
-    assert found["provenance"]["iterations_done"] == first_with_best - 1 + PATIENCE * every < 4000
+    assert trained["provenance"]["iterations_done"] == first_with_best - 1 + PATIENCE * every < 4000
     _, validation, _ = dataset.split(data, 3, "blocks", 0)
-    again = float(estimation_errors(checkpoints.network_of(found), validation).mean())
+    again = float(estimation_errors(checkpoints.network_of(trained), validation).mean())
     assert again == pytest.approx(best, abs=1e-4)
 
 
@@ -332,10 +332,10 @@ def test_time_budget_ends_the_run_at_progress_1(tmp_path):
     now = iter(np.arange(0.0, 1e6, 0.5))  # every reading of the clock takes half a second
     reports = []
     changed = dataclasses.replace(SMALL, iterations=100000, minutes=0.5)
-    found = train.train([make()], tmp_path / "model.pt", changed, reports.append, clock=lambda: float(next(now)))
-    assert found["provenance"]["seconds"] == pytest.approx(30, abs=2)
+    trained = train.train([make()], tmp_path / "model.pt", changed, reports.append, clock=lambda: float(next(now)))
+    assert trained["provenance"]["seconds"] == pytest.approx(30, abs=2)
     assert reports[-1].progress >= 1.0
-    assert found["provenance"]["iterations_done"] < 100
+    assert trained["provenance"]["iterations_done"] < 100
 
 
 def test_learning_rate_is_one_cycle():
@@ -351,14 +351,14 @@ def test_learning_rate_is_one_cycle():
 
 def test_several_data_sets_of_one_robot_train_one_model(tmp_path):
     data = [make(), make(5, seed=1)]
-    found = train.train(data, tmp_path / "model.pt", SMALL)["provenance"]
+    trained = train.train(data, tmp_path / "model.pt", SMALL)["provenance"]
     alone = [train.train([each], tmp_path / f"{i}.pt", SMALL)["provenance"] for i, each in enumerate(data)]
-    assert found["samples"] == 450
-    assert found["windows"] == list(np.sum([each["windows"] for each in alone], axis=0))
-    assert len({found["data_sha256"], *(each["data_sha256"] for each in alone)}) == 3
-    assert [generation["seed"] for generation in found["generation"]] == [0, 1]
+    assert trained["samples"] == 450
+    assert trained["windows"] == list(np.sum([each["windows"] for each in alone], axis=0))
+    assert len({trained["data_sha256"], *(each["data_sha256"] for each in alone)}) == 3
+    assert [generation["seed"] for generation in trained["generation"]] == [0, 1]
     swapped = train.train(data[::-1], tmp_path / "swapped.pt", SMALL)["provenance"]
-    assert swapped["data_sha256"] != found["data_sha256"]
+    assert swapped["data_sha256"] != trained["data_sha256"]
 
 
 def test_data_sets_of_different_robots_are_refused(tmp_path):
@@ -371,6 +371,6 @@ def test_data_sets_of_different_robots_are_refused(tmp_path):
 def test_evenly_spread_windows_are_at_most_the_number_given():
     windows = dataset.Windows(np.arange(100, dtype=np.float32)[:, None, None], np.zeros((100, 1, 1), np.float32))
     assert len(windows.evenly(100)) == 100
-    found = windows.evenly(30).features[:, 0, 0]
-    assert len(found) == 25
-    assert set(np.diff(found)) == {4.0}
+    values = windows.evenly(30).features[:, 0, 0]
+    assert len(values) == 25
+    assert set(np.diff(values)) == {4.0}

@@ -72,10 +72,10 @@ def test_killed_run_resumes_and_ends_with_the_same_model(folder):
 
 
 def test_network_option_selects_the_network(folder):
-    found = run(folder, "d.h5", "--out", "m.pt", "--network", "lstm", *QUICK)
-    assert found.returncode == 0, found.stderr
-    made = checkpoints.load(folder / "m.pt")
-    assert (made["network"]["name"], made["provenance"]["truncation_probability"]) == ("lstm", 0.0)
+    result = run(folder, "d.h5", "--out", "m.pt", "--network", "lstm", *QUICK)
+    assert result.returncode == 0, result.stderr
+    checkpoint = checkpoints.load(folder / "m.pt")
+    assert (checkpoint["network"]["name"], checkpoint["provenance"]["truncation_probability"]) == ("lstm", 0.0)
     choice = next(option for option in train_cli.cli.params if option.name == "network").type
     assert tuple(choice.choices) == NETWORKS
 
@@ -102,19 +102,19 @@ def test_network_option_selects_the_network(folder):
 )
 def test_mistakes_end_in_one_clear_line(folder, arguments, code, message):
     (folder / "bad.h5").write_bytes(b"no")
-    found = run(folder, *arguments)
-    assert (found.returncode, found.stdout) == (code, "")
-    assert message in found.stderr
-    assert "Traceback" not in found.stderr
+    result = run(folder, *arguments)
+    assert (result.returncode, result.stdout) == (code, "")
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
     if code not in (2, 77):  # a usage line, or the progress bar, comes before it
-        assert found.stderr.count("\n") == 1
+        assert result.stderr.count("\n") == 1
 
 
 def test_bfloat16_without_units_for_it_is_refused_in_one_line(folder):
     limited = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2"}
-    found = run(folder, "d.h5", "--precision", "bfloat16", **limited)
-    assert (found.returncode, found.stdout) == (2, "")
-    assert found.stderr == (
+    result = run(folder, "d.h5", "--precision", "bfloat16", **limited)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr == (
         "modsoft-train: precision bfloat16: this machine has no units for it; give --precision float32\n"
     )
     assert [path.name for path in folder.iterdir()] == ["d.h5"]
@@ -123,7 +123,7 @@ def test_bfloat16_without_units_for_it_is_refused_in_one_line(folder):
 def test_help_does_not_import_torch(folder):
     code = "import sys; from modsoft.training import train_cli; assert 'torch' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code], cwd=folder, check=False).returncode == 0
-    found = run(folder, "--help")
-    assert found.returncode == 0
+    result = run(folder, "--help")
+    assert result.returncode == 0
     for option in ("--out", "--minutes", "--split", "--seed", "Example"):
-        assert option in found.stdout
+        assert option in result.stdout

@@ -69,10 +69,10 @@ class Pty:
         self.master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self.master, False)
-        made = self.link.with_name(self.link.name + ".new")
-        made.unlink(missing_ok=True)
-        made.symlink_to(os.ttyname(self._slave))
-        made.replace(self.link)
+        new_link = self.link.with_name(self.link.name + ".new")
+        new_link.unlink(missing_ok=True)
+        new_link.symlink_to(os.ttyname(self._slave))
+        new_link.replace(self.link)
         self._pending = b""
 
     def unplug(self) -> None:
