@@ -24,7 +24,7 @@ def main() -> None:
         board.arm(robot)
         pressures_bar = np.zeros(CHANNELS)
         pressures_bar[robot.chambers[0].channel] = 0.1
-        for tick in range(3):  # a board that hears nothing for 0.3 s vents by itself
+        for tick in range(3):  # a board that receives nothing for 0.3 s vents by itself
             board.set_pressures(tick, pressures_bar)
             time.sleep(0.1)
         board.check()  # raises what went wrong

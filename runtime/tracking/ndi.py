@@ -143,7 +143,7 @@ def checked_tools(kind: str, tools: list[Path], count: int) -> list[Path]:
         if path.is_dir():
             raise UsageError(f"tool definition file {path} is a folder; give the .rom file in it")
         if not path.is_file():
-            raise DeviceAbsent(f"tool definition file {path} does not exist; the tracker cannot know that tool")
+            raise DeviceAbsent(f"tool definition file {path} does not exist; the tracker needs it for that tool")
     return tools
 
 

@@ -69,18 +69,18 @@ def test_row_05_garbage_at_line_rate(matrix_row, full):
             port.idle(0.02)  # until the last of them is in
             flood, since = inject(emulated, f"flood {FLOOD_S * 1000}")
 
-            def hear(kind, until_s):
+            def receive(kind, until_s):
                 while not any(isinstance(message, kind) for message in heard) and port.clock() < until_s:
                     heard.extend(frame.message for frame in parser.feed(port.read(256)))
 
             over_s = flood["t_us"] * 1e-6 + FLOOD_S
-            hear(Hello, over_s)
+            receive(Hello, over_s)
             heard.clear()
             port.write(b"\0" + encode(HelloReq(PROTOCOL_HASH)))
-            hear(Hello, over_s + 5.0)
+            receive(Hello, over_s + 5.0)
             answered_ms = (port.clock() - over_s) * 1e3
             heard.clear()
-            hear(Status, over_s + 10.0)
+            receive(Status, over_s + 10.0)
             [status] = heard
             assert (status.state, status.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
             assert status.rx_good == len(sent) + 1, "no frame in the garbage was accepted"

@@ -129,7 +129,7 @@ def test_row_32_wrong_checksums(matrix_row, full, tmp_path):
         32,
         fault="wrong checksums in a row, then right ones",
         tries=tries,
-        limit="0 used, client goes on without a restart",
+        limit="0 used, client continues without a restart",
         worst=f"frames again after {read.first_s * 1e3:.0f} ms",
         clock="host",
     )

@@ -84,7 +84,7 @@ def test_row_13_tracker_off(matrix_row, full):
         13,
         fault="tracker intermittent, up to 0.8 s",
         tries=ticks,
-        limit="command held, run goes on",
+        limit="command held, run continues",
         worst=f"{most} of 50 ticks held",
         clock="virtual",
     )
@@ -239,7 +239,7 @@ ROBOTS = {"pneumatic-3": (6.0, 36.0, 90.0), "pneumatic-2": (30.0, 75.0)}  # how 
 
 
 def random_partial(rng, count):
-    """(what, spoil): some way in which a frame of `count` tools is not the state of the robot."""
+    """(what, corrupt): some way in which a frame of `count` tools is not the state of the robot."""
     match rng.integers(4):
         case 0:
             valid = np.ones(count, bool)
@@ -265,9 +265,9 @@ def test_row_18_hidden_wrong_number_swapped(matrix_row, full):
         world = restless(World(steps=20, robot=robot_file.load(name)))
         world.frame_age_s = rng.uniform(0.002, 0.045)
         world.angles = tuple(rng.uniform(-1, 1, len(ROBOTS[name])) * ROBOTS[name])
-        what, spoil = random_partial(rng, len(ROBOTS[name]) + 1)
+        what, corrupt = random_partial(rng, len(ROBOTS[name]) + 1)
         kinds.add(what)
-        world.corrupted.append((world.time_s + rng.uniform(PERIOD_S, RUN_S), np.inf, spoil))
+        world.corrupted.append((world.time_s + rng.uniform(PERIOD_S, RUN_S), np.inf, corrupt))
         worst_s = max(worst_s, ended(world))
         bad = [record for record in world.ticks if record.frame_status != "good"]
         assert len(bad) == 3

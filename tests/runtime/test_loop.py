@@ -109,7 +109,7 @@ def test_a_bad_frame_holds_the_command_and_the_state():
 
 
 @pytest.mark.parametrize("phase_s", np.arange(0.0, PERIOD_S, 0.05))
-def test_a_tracker_that_falls_silent_ends_the_run_in_time_whatever_the_phase(phase_s):
+def test_silent_tracker_ends_the_run_in_time_at_any_phase(phase_s):
     world = World(steps=20)
 
     def fall_silent():

@@ -1,6 +1,6 @@
 """A fake tracker of passive tools on a pseudo-terminal, in a process of its own.
 
-`python -m modsoft.hil.polaris --link PATH` makes PATH a serial port that speaks the device's ASCII protocol (and its
+`python -m modsoft.hil.polaris --link PATH` makes PATH a serial port with the device's ASCII protocol (and its
 binary `BX` answer) well enough for the unmodified scikit-surgerynditracker. With `--type vega` it is on a network
 port of this machine instead of PATH; with `--type aurora` and `--wired N` it has N wired tools. It is a process because
 that client holds the interpreter lock while it looks for a device. Standard input has one JSON object a line with any
