@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import mega_in_run
 import pytest
+from floating_pins import add_rows, down_ms
 from mega_in_run import Host, in_stepped_run, inject, side_by_side
 from output_rises import rises
 
@@ -142,6 +143,8 @@ def test_row_06_cable_pulled(matrix_row, full):
 
 
 def test_row_08_board_reset_in_mid_run(matrix_row, full):
+    floating = []
+
     def attempt(number):
         with in_stepped_run() as (host, emulated):
             reset, since = inject(emulated, ("reset", "power-cycle")[number % 2])
@@ -155,6 +158,7 @@ def test_row_08_board_reset_in_mid_run(matrix_row, full):
                 host.board.set_pressures(host.tick + 1, [Host.BAR])
             assert len(host.port.written) == silent, "no byte after the loss was found"
             assert rises(emulated.trace, since) == 0
+            floating.append(down_ms(emulated, reset["t_us"]))
             return vented_ms(emulated, since, reset["t_us"]), noticed_ms, back_ms
 
     tries = 50 if full else 20
@@ -170,6 +174,9 @@ def test_row_08_board_reset_in_mid_run(matrix_row, full):
     assert vented <= 130
     assert noticed <= 1200
     assert back <= 6000
+    add_rows(
+        matrix_row, 8, "board reset in mid-run: pins", floating, "holds until setup(), 6 s", lambda ms: 800 < ms < 6000
+    )
 
 
 @pytest.mark.realtime
@@ -205,6 +212,8 @@ def test_row_10_host_killed(matrix_row, full):
 
 
 def test_row_28_firmware_hangs(matrix_row, full):
+    floating = []
+
     def attempt(number):
         with in_stepped_run() as (host, emulated):
             hang, since = inject(emulated, ("hang", "hang cli")[number % 2], "hang")
@@ -213,6 +222,7 @@ def test_row_28_firmware_hangs(matrix_row, full):
             assert host.board.vent(), "the board restarted and confirms the vent"
             assert host.board.status.boot_id == host.board.hello.boot_id + 1
             assert rises(emulated.trace, since) == 0
+            floating.append(down_ms(emulated, hang["t_us"]))
             return vented_ms(emulated, since, hang["t_us"])
 
     tries = 100 if full else 10
@@ -221,6 +231,16 @@ def test_row_28_firmware_hangs(matrix_row, full):
         28, fault="firmware hangs", tries=tries, limit="all 0 in 130 ms", worst=f"{vented:.1f} ms", clock="emulated"
     )
     assert vented <= 130
+    hang_ms = 130.0
+    add_rows(
+        matrix_row,
+        28,
+        "firmware hangs: pins",
+        floating,
+        "holds until setup(), 6 s",
+        lambda ms: 800 < ms < 6000,
+        hang_ms,
+    )
 
 
 def test_row_29_sensors(matrix_row, full):

@@ -13,12 +13,13 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from floating_pins import PULLED_DOWN_MS, add_rows, down_ms
 from mega_in_run import Host, in_stepped_run, inject, stepped_host
 from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.hil.board.toolchain import FIRMWARE, FIRMWARE_ELF, build, missing_packages
-from modsoft.hil.outputs import command_down_after_ms, read_outputs
+from modsoft.hil.outputs import read_outputs
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.protocol import NOT_MEASURED, Fault, State
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ProtocolMismatch, Tripped
@@ -29,40 +30,10 @@ pytestmark = [
     pytest.mark.timeout(1800),
 ]
 
-PULLED_DOWN_MS = 250.0  # 0.11 s * ln(0.35 bar / 0.05 bar) is 214 ms
 SENSORS_45 = "SENSOR_ZERO_MV=500 SENSOR_FULL_MV=4500 SENSORS=0x0fff"
 ROBOT_45 = robot_file.parse(
     robot_file.text_of("pneumatic-3").replace("zero_v = 0.0", "zero_v = 0.5").replace("full_v = 5.0", "full_v = 4.5")
 )
-
-
-def down_ms(emulated, from_us):
-    """(with, without pull-downs) milliseconds until every command is down, up to now."""
-    outputs, now_us = read_outputs(emulated.trace), emulated.last_run["t_us"]
-    return [command_down_after_ms(outputs, from_us, now_us, pull_downs) for pull_downs in (True, False)]
-
-
-def add_rows(matrix_row, row, fault, results, without_limit, without_met):
-    """The two lines of a row: with pull-downs, and without, where the limit states what the hardware then does."""
-    with_ms, without_ms = (max(column) for column in zip(*results, strict=True))
-    matrix_row(
-        row,
-        fault=f"{fault}, pull-downs fitted",
-        tries=len(results),
-        limit=f"down in {PULLED_DOWN_MS:.0f} ms",
-        worst=f"{with_ms:.0f} ms",
-        clock="emulated",
-    )
-    matrix_row(
-        row,
-        fault=f"{fault}, no pull-downs",
-        tries=len(results),
-        limit=without_limit,
-        worst="pressure holds" if math.isinf(without_ms) else f"pressure holds for {without_ms / 1000:.2f} s",
-        clock="emulated",
-    )
-    assert with_ms <= PULLED_DOWN_MS
-    assert without_met(without_ms)
 
 
 def test_row_40_floating_pins_on_opening_the_port(matrix_row, full):
