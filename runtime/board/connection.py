@@ -187,10 +187,9 @@ class Connection:
         if status.acked_seq in self._unacked and frame.session == self.session:
             self.ack_latency_s = now - self._unacked[status.acked_seq]
             self.missed_acks = 0
-            for seq in list(self._unacked):  # in the order of sending; newer ones remain
+            sent = list(self._unacked)  # in the order of sending; newer ones remain
+            for seq in sent[: sent.index(status.acked_seq) + 1]:
                 del self._unacked[seq]
-                if seq == status.acked_seq:
-                    break
         self._settle(status, frame.session)
 
     def _settle(self, status: Status, board_session: int) -> None:

@@ -198,6 +198,15 @@ def test_bytes_and_bad_frames_are_counted():
     assert (connection.counts["bytes"], connection.counts["bad_frames"]) == (len(encode(HELLO)) + 10, 2)
 
 
+def test_messages_of_a_host_have_no_effect_on_the_connection():
+    """A device that echoes what it receives."""
+    connection = ready()
+    before = (connection.phase, connection.status, connection.status_at, connection.missed_acks)
+    connection.feed(encode(Heartbeat(1)) + encode(Set(1, OPEN)), 0.1)
+    assert (connection.phase, connection.status, connection.status_at, connection.missed_acks) == before
+    assert connection.counts["refused"] == connection.counts["bad_frames"] == 0
+
+
 # ---- heartbeats
 
 
