@@ -39,7 +39,7 @@
 
 /* An output outside these millivolts is a broken wire or sensor: halfway from the sensor's range to 0 V and to 5 V. */
 #define SENSOR_LEAST_MV (SENSOR_ZERO_MV / 2)
-#define SENSOR_MOST_MV ((SENSOR_FULL_MV + 5000) / 2)
+#define SENSOR_MOST_MV (SENSOR_FULL_MV / 2 + 2500)
 
 /* The chip's reference voltage, 1100 mV within 10 %, by which the supply is measured. To calibrate it, multiply it by the
  * supply at a voltmeter and divide by the supply in the run log. */
