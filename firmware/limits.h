@@ -41,8 +41,8 @@
 #define SENSOR_LEAST_MV (SENSOR_ZERO_MV / 2)
 #define SENSOR_MOST_MV (SENSOR_FULL_MV / 2 + 2500)
 
-/* The chip's reference voltage, 1100 mV within 10 %, by which the supply is measured. To calibrate it, multiply it by the
- * supply at a voltmeter and divide by the supply in the run log. */
+/* The chip's reference voltage, 1100 mV within 10 %, by which the supply is measured. To calibrate it, multiply it by
+ * the supply at a voltmeter and divide by the supply in the run log. */
 #ifndef REFERENCE_MV
 #define REFERENCE_MV 1100
 #endif

@@ -144,9 +144,9 @@ class Board:
             raise LostInRun(f"the board at {self.name} received nothing in time and vented by itself; start again")
         if status is not None and status.faults:
             cause = fault_names(status.faults)
-            if status.faults & Fault.SUPPLY and self._connection.hello is not None:
-                least_v = self._connection.hello.supply_least_mv / 1000
-                cause += f" (supply now {status.supply_mv / 1000:.2f} V, expected at least {least_v:g} V)"
+            if status.faults & Fault.SUPPLY:
+                supply_v, least_v = status.supply_mv / 1000, self.hello.supply_least_mv / 1000
+                cause += f" (supply now {supply_v:.2f} V, expected at least {least_v:g} V)"
             raise Tripped(f"the board vented by itself: {cause}; remove the cause and start again")
 
     # ---- requests
@@ -184,7 +184,6 @@ class Board:
             self._io_thread.wait(lambda: False, self._clock() + ARM_RETRY_S)
 
     def _check_no_pressure(self, nack: Nack | None) -> None:
-        """Raise `Tripped` if the board refused to arm because of a measured pressure."""
         if nack is not None and nack.reason == NackReason.PRESSURE:
             pressures = ", ".join(f"channel {c}: {bar:.3f}" for c, bar in self._pressures_left().items())
             raise Tripped(
@@ -296,7 +295,7 @@ class Board:
         what = f"received {received} bytes of another protocol: wrong baud rate?" if received else "no byte received"
         after = f" after {resets} resets" if resets else ""
         raise DeviceAbsent(
-            f"no board found at {self.name}{after} ({what}); "
-            f"give another port, or flash the firmware (make -C firmware flash PORT={self.name}); if it stopped "
-            "during a run, its bootloader may reset repeatedly: remove its power and see docs/hardware.md"
+            f"no board found at {self.name}{after} ({what}); give another port, or flash the firmware "
+            f"(make -C firmware flash PORT={self.name}); if it stopped during a run, its bootloader may reset "
+            "repeatedly: remove its power and see docs/hardware.md"
         )
