@@ -22,7 +22,6 @@ from modsoft.runtime.board.protocol import (
     UNITS_PER_BAR,
     Fault,
     Hello,
-    Nack,
     NackReason,
     Set,
     State,
@@ -162,7 +161,7 @@ class Board:
         self._io_thread.wait(lambda: self._connection.status is not None, deadline)
         if self.status is not None and self.status.faults and not self.status.faults & ~HOST_DISCONNECTED:
             self.clear_fault()
-        nack: Nack | None = None
+        nack = None
         while True:
             self._io_thread.wait(lambda: self._connection.can_arm, deadline)
             self.check()
@@ -178,13 +177,13 @@ class Board:
             if nack is not None and nack.reason not in (NackReason.STATE, NackReason.PRESSURE):
                 raise ProtocolMismatch(f"board at {self.name} refused to arm: {refusal(nack)}")
             if self._clock() >= deadline:
-                self._check_no_pressure(nack)
+                self._check_no_pressure(nack and nack.reason)
                 state = State(status.state).name if status is not None and status.state in set(State) else "unknown"
                 raise Tripped(f"board at {self.name} did not arm within {ARM_WAIT_S:.0f} s, its state is {state}")
             self._io_thread.wait(lambda: False, self._clock() + ARM_RETRY_S)
 
-    def _check_no_pressure(self, nack: Nack | None) -> None:
-        if nack is not None and nack.reason == NackReason.PRESSURE:
+    def _check_no_pressure(self, refusal_reason: int | None) -> None:
+        if refusal_reason == NackReason.PRESSURE:
             pressures = ", ".join(f"channel {c}: {bar:.3f}" for c, bar in self._pressures_left().items())
             raise Tripped(
                 f"board at {self.name} did not arm: the sensors measure {pressures} bar, expected less than "
