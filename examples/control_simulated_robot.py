@@ -16,7 +16,7 @@ def main() -> None:
     robot = robot_file.load("pneumatic-3")
     model = Model.load(Path(sys.argv[1]) if len(sys.argv) > 1 else SHIPPED)
     model.check(robot)  # trained for a robot of this kind?
-    desired = task("down", "pneumatic", robot.modules)  # (K, N, 3), one configuration a control step
+    desired = task("down", "planar", robot.modules)  # (K, N, 3), one configuration a control step
     arm = simulated("pneumatic", robot.modules, 1)
     run = rollout(arm, [ControllerSetup(robot, model.actuate, model.history, desired)]).robots()[0]
     for module, error in enumerate(angle_errors_deg(run.configuration, desired).mean(axis=0), start=1):

@@ -54,9 +54,8 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
     click.echo(f"{exported.path}: {exported.path.stat().st_size / 1e6:.1f} MB, SHA-256 {description.file_sha256}")
     modules = ", ".join(map(str, description.modules_trained_on))
     fixed = "" if description.network.modules is None else ", fixed"
-    click.echo(
-        f"for {description.kind} robots at {1.0 / description.period_s:g} Hz, trained on {modules} modules{fixed}"
-    )
+    robots = f"{description.layout.motion} robots with {description.layout.drive}"
+    click.echo(f"for {robots} at {1.0 / description.period_s:g} Hz, trained on {modules} modules{fixed}")
     click.echo(
         f"largest difference from torch, relative to the output range (limit {report.bound:.1e}; "
         f"of torch in float32 {report.torch_error:.1e}):"

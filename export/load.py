@@ -91,7 +91,7 @@ def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
             "dropout": 0.0,
             "history": options.history,
         },
-        "features": feature_names(robot.kind, options.history),
+        "features": feature_names(robot.motion, options.history),
         "weights": weights,
         "provenance": options.provenance,
     }
@@ -113,19 +113,19 @@ def _check(checkpoint: dict[str, Any], path: Path) -> None:
     except RobotFileError as error:  # in this file, not in a robot file that the user can correct
         raise ModelError(f"{error}; train it again with this version") from error
     network = network_of(checkpoint, str(path))
-    kind, history = robot.kind, network.history
+    motion, history = robot.motion, network.history
     fixed = None if network.name == "bilstm" else robot.modules
     if network.modules != fixed:
         raise ModelError(f"{path}: {network.name} of {network.modules} modules, expected {fixed}; train it again")
-    expected = feature_names(kind, history)
+    expected = feature_names(motion, history)
     if list(checkpoint["features"]) != expected:
-        raise ModelError(f"{path}: features {list(checkpoint['features'])}, expected for {kind} {expected}")
+        raise ModelError(f"{path}: features {list(checkpoint['features'])}, expected for {motion} motion {expected}")
     for name, size, required in (
         ("feature_size", network.feature_size, len(expected)),
         ("action_size", network.action_size, robot.action_size),
     ):
         if size != required:
-            raise ModelError(f"{path}: {name} {size}, expected {required} for {kind} and history {history}")
+            raise ModelError(f"{path}: {name} {size}, expected {required} for {motion} motion and history {history}")
     for name, tensor in checkpoint["weights"].items():
         if tensor.dtype != torch.float32:
             raise ModelError(f"{path}: weight {name} is {tensor.dtype}, expected torch.float32")

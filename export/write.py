@@ -83,7 +83,7 @@ def describe(checkpoint: dict[str, Any], sizes: Network, weights: Weights, expec
         opset=model_file.OPSET,
         ir_version=model_file.IR_VERSION,
         sequence_axis=sizes.sequence_axis,
-        kind=robot.kind,
+        layout=model_file.layout_of(robot),
         state_size=robot.state_size,
         action_size=robot.action_size,
         period_s=robot.loop.period_s,

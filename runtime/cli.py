@@ -34,7 +34,7 @@ def _check_robot(name: str) -> None:
             steps = len(load_task(task, robot))
         except UsageError as error:
             raise RobotFileError(f"{name}: task under [loop]: {error}") from error
-    click.echo(f"{name}: {robot.name}, {robot.kind}, {robot.modules} modules, {robot.loop.hz:g} Hz")
+    click.echo(f"{name}: {robot.name}, {robot.motion}, {robot.modules} modules, {robot.loop.hz:g} Hz")
     if task:
         click.echo(f"task {task}: {steps} steps, {steps * robot.loop.period_s:g} s")
     if robot.valve is not None:
@@ -44,7 +44,7 @@ def _check_robot(name: str) -> None:
             f"{valve.p_max_bar:g} bar; is full_scale_bar what the label says?"
         )
     for chamber in robot.chambers:
-        click.echo(f"module {chamber.module} side {chamber.side}: channel {chamber.channel}")
+        click.echo(f"module {chamber.module}, chamber at {chamber.direction_deg:g} degrees: channel {chamber.channel}")
     open_ends = _open_ends(robot, folder)
     if open_ends:
         click.echo(f"still to fill in before a run: {'; '.join(open_ends)}")

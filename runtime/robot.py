@@ -9,46 +9,32 @@ from __future__ import annotations
 import re
 import tomllib
 from collections import Counter
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NoReturn
 
 import msgspec
 from msgspec import Meta
 
+from modsoft.runtime import layout
 from modsoft.runtime.errors import RobotFileError
 from modsoft.runtime.files import read_text
+from modsoft.runtime.layout import MOTIONS, Actuators, Section, Simulation
 from modsoft.runtime.validation_messages import explain
 
-
-class Kind(NamedTuple):
-    """Properties of a kind of robot. state, action: names of the components, in feature order."""
-
-    state: tuple[str, ...]
-    action: tuple[str, ...]
-    directions: tuple[tuple[float, ...], ...]  # unit directions in which each cable or chamber bends its module
-
-
-KINDS: dict[str, Kind] = {
-    "cable": Kind(("v_z", "v_x", "v_y"), ("a_0", "a_1"), ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))),
-    "pneumatic": Kind(("v_x", "v_y"), ("a_0",), ((1.0,), (-1.0,))),
-}
-
 LEAST_SENSOR_SPAN_V = 1.0  # as in firmware/limits.h
+
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)]
 Bar = Annotated[float, Meta(ge=0.0, le=10.0)]
 
 
-class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the robot file. Frozen; unknown keys are errors."""
-
-
 class Identity(Section, frozen=True):
-    """`[robot]`"""
+    """`[robot]`. motion: "planar" modules bend in the x-z plane, "spatial" ones in every direction."""
 
     name: Name
-    kind: Literal["cable", "pneumatic"]
+    motion: Literal["planar", "spatial"]
     modules: Annotated[int, Meta(ge=2, le=64)]  # one module has no label: eq. (1) divides by N - 1
 
 
@@ -74,11 +60,11 @@ class Sensors(Section, frozen=True):
 class Chamber(Section, frozen=True):
     """`[[chambers]]`: valve channel of a chamber, and the correction of its pressure.
 
-    side `+` inflates for a_0 > 0, `-` for a_0 < 0 (eq. 3); pressure sent = gain * pressure + offset_bar.
+    direction_deg: the entry of `directions_deg` that it is at; pressure sent = gain * pressure + offset_bar.
     """
 
     module: Annotated[int, Meta(ge=1)]
-    side: Literal["+", "-"]
+    direction_deg: float
     channel: Annotated[int, Meta(ge=0, le=11)]
     gain: Annotated[float, Meta(gt=0.0, le=2.0)] = 1.0
     offset_bar: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
@@ -133,10 +119,12 @@ class Loop(Section, frozen=True):
 
 
 class Robot(Section, frozen=True):
-    """A robot file. `kind` determines state and action sizes; a cable robot is simulated and has no valves."""
+    """A robot file. `motion` determines state and action sizes; a robot with cables is simulated, without valves."""
 
     robot: Identity
+    actuators: Actuators
     loop: Loop
+    simulation: Simulation | None = None
     valve: Valve | None = None
     sensors: Sensors = Sensors(full_scale_bar=1.0)
     chambers: tuple[Chamber, ...] = ()
@@ -154,22 +142,33 @@ class Robot(Section, frozen=True):
         return self.robot.modules
 
     @property
-    def kind(self) -> str:
-        """Key of `KINDS`: "cable" or "pneumatic"."""
-        return self.robot.kind
+    def motion(self) -> str:
+        """Key of `MOTIONS`: "planar" or "spatial"."""
+        return self.robot.motion
+
+    @property
+    def preset(self) -> str:
+        """Preset of the simulated robot. `RobotFileError` for a robot that cannot be simulated."""
+        if self.simulation is None:
+            raise RobotFileError(f"robot {self.name} has no [simulation], expected one: it is simulated here")
+        return self.simulation.preset
 
     @property
     def state_size(self) -> int:
-        return len(KINDS[self.kind].state)
+        return len(MOTIONS[self.motion].state)
 
     @property
     def action_size(self) -> int:
-        return len(KINDS[self.kind].action)
+        return len(MOTIONS[self.motion].action)
 
     @property
     def directions(self) -> tuple[tuple[float, ...], ...]:
         """Unit direction (A components) in which each actuator bends its module."""
-        return KINDS[self.kind].directions
+        return layout.bending_directions(self.motion, self.actuators.drive, self.actuators.directions_deg)
+
+    def actuator_of(self, chamber: Chamber) -> int:
+        """Index of a chamber among the actuators of its module."""
+        return self.actuators.directions_deg.index(chamber.direction_deg)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain Python values, for a checkpoint, ONNX metadata or a log."""
@@ -233,6 +232,7 @@ def parse(text: str, where: str = "robot file") -> Robot:
 
 def from_dict(table: dict[str, Any], where: str = "robot") -> Robot:
     """Converts plain values (of a checkpoint, ONNX metadata, TOML) to `Robot`, with the same checks as the file."""
+    table = layout.with_preset(table, where)
     try:
         robot = msgspec.convert(table, Robot)
     except msgspec.ValidationError as error:
@@ -244,21 +244,21 @@ def from_dict(table: dict[str, Any], where: str = "robot") -> Robot:
 def _check(robot: Robot, where: str) -> None:
     """Checks the relations between keys."""
 
-    def refuse(found: str, expected: str) -> None:
+    def refuse(found: str, expected: str) -> NoReturn:
         raise RobotFileError(f"{where}: {found}; expected {expected}")
 
     count = robot.modules
     if robot.tracker.tools and len(robot.tracker.tools) != count + 1:
         refuse(f"tracker.tools has {len(robot.tracker.tools)} entries", f"{count + 1}: base, then modules 1 to {count}")
-    if robot.kind == "cable":
+    layout.check_actuators(robot.motion, robot.actuators, robot.simulation, refuse)
+    if robot.actuators.drive == "cables":
         if robot.valve is not None or robot.chambers:
             refuse("a cable robot with [valve] or [[chambers]]", "neither: cable robots are simulated")
         return
 
     valve = robot.valve
     if valve is None:
-        refuse("a pneumatic robot without [valve]", "one, with full_scale_bar from the valve's label")
-        return
+        refuse("a robot with chambers without [valve]", "one, with full_scale_bar from the valve's label")
     if not valve.p_min_bar < valve.p_max_bar <= valve.full_scale_bar:
         refuse(
             f"valve pressures p_min_bar {valve.p_min_bar}, p_max_bar {valve.p_max_bar}, "
@@ -270,20 +270,23 @@ def _check(robot: Robot, where: str) -> None:
             f"[sensors] zero_v {robot.sensors.zero_v}, full_v {robot.sensors.full_v}",
             f"full_v at least {LEAST_SENSOR_SPAN_V} V above zero_v",
         )
-    required: Counter[tuple[int, str]] = Counter((module, side) for module in range(1, count + 1) for side in "+-")
-    chambers: Counter[tuple[int, str]] = Counter((chamber.module, chamber.side) for chamber in robot.chambers)
+    _check_chambers(robot, refuse)
+
+
+def _check_chambers(robot: Robot, refuse: Callable[[str, str], NoReturn]) -> None:
+    """Whether every module has all of its chambers, each on a channel of its own."""
+    count, degrees = robot.modules, robot.actuators.directions_deg
+    required = Counter((module, direction) for module in range(1, count + 1) for direction in degrees)
+    chambers = Counter((chamber.module, chamber.direction_deg) for chamber in robot.chambers)
     if chambers != required:
         wrong = [
-            f"{label}: {', '.join(f'module {module} side {side}' for module, side in sorted(places))}"
-            for label, places in (
-                ("missing", required - chambers),
-                ("too many", chambers - required),
-            )
+            f"{label}: {', '.join(f'module {module} at {direction:g}' for module, direction in sorted(places))}"
+            for label, places in (("missing", required - chambers), ("too many", chambers - required))
             if places
         ]
         refuse(
-            f"[[chambers]] of {count} modules, {'; '.join(wrong)}",
-            f"one chamber '+' and one '-' for each module from 1 to {count}: "
+            f"[[chambers]] of {count} modules, {'; '.join(wrong)} degrees",
+            f"one chamber at each of {layout.listed(degrees)} degrees for each module from 1 to {count}: "
             "add or delete [[chambers]], or correct modules under [robot]",
         )
     channels = Counter(chamber.channel for chamber in robot.chambers)

@@ -204,10 +204,10 @@ def _robot(options: Options) -> tuple[Robot, str, Path]:
             "modsoft-runtime --print-robot pneumatic-3 > robot.toml"
         )
     robot = robot_file.load(options.robot)
-    if robot.kind != "pneumatic":
+    if robot.valve is None:
         raise RobotFileError(
-            f"robot {robot.name} is of kind {robot.kind!r}, which is only simulated (modsoft-simulate); "
-            "modsoft-runtime drives pneumatic robots"
+            f"robot {robot.name} has no [valve], so it is only simulated (modsoft-simulate); modsoft-runtime drives "
+            "robots with chambers"
         )
     if options.tracker:
         table = robot.to_dict()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
@@ -21,12 +22,12 @@ def explain(table: Any, kind: type[msgspec.Struct], error: msgspec.ValidationErr
     key = re.search(r"field `(.*)`", reason)
     if key is not None and "unknown" in reason:
         known = [field.name for field in msgspec.structs.fields(_struct(expected))]
-        return f"unknown key {key[1]!r} {_under(at)}{_suggestion(key[1], known)}; the keys there are {', '.join(known)}"
+        return f"unknown key {key[1]!r} {_under(at)}{suggestion(key[1], known)}; the keys there are {', '.join(known)}"
     if key is not None:
         return f"{key[1]} {_under(at)} is missing; add it, expected {_allowed(_field(expected, key[1]), reason)}"
     place = f"{at[-1]} {_under(at[:-1])}" if at else "the whole file"
     return (
-        f"{place}: found {_short(value)}{_suggestion(value, _choices(expected))}; expected {_allowed(expected, reason)}"
+        f"{place}: found {_short(value)}{suggestion(value, _choices(expected))}; expected {_allowed(expected, reason)}"
     )
 
 
@@ -71,7 +72,8 @@ def _choices(expected: Any) -> list[Any]:
     return list(get_args(_plain(expected))) if get_origin(_plain(expected)) is Literal else []
 
 
-def _suggestion(value: Any, known: list[Any]) -> str:
+def suggestion(value: Any, known: Iterable[Any]) -> str:
+    """The entry of `known` that resembles `value`, as a question; empty without one."""
     near = difflib.get_close_matches(value, [str(entry) for entry in known], 1) if isinstance(value, str) else []
     return f", did you mean {near[0]!r}?" if near else ""
 

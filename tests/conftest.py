@@ -72,7 +72,7 @@ def make_checkpoint():
         from modsoft.training import networks
 
         description = robot_file.load(robot)
-        names = feature_names(description.kind, history)
+        names = feature_names(description.motion, history)
         sizes = {"name": name, "feature_size": len(names), "action_size": description.action_size, "layers": layers}
         sizes |= {"hidden": hidden, "dropout": 0.1, "history": history}
         if name != "bilstm":

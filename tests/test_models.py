@@ -40,10 +40,10 @@ def test_shipped_model_controls_its_robot(file, robot, task, limit):
     and below half of that of a robot that does not move."""
     robot = robot_file.load(robot)
     controller = Model.load(MODELS / f"{file}.onnx")
-    desired = tasks.task(task, robot.kind, robot.modules)[:60]
+    desired = tasks.task(task, robot.motion, robot.modules)[:60]
     setup = ControllerSetup(robot, controller.actuate, controller.history, desired)
-    (run,) = rollout.rollout(Fleet(robot.kind, robot.modules, 1), [setup]).robots()
-    errors = rollout.angle_errors_deg if robot.kind == "pneumatic" else rollout.configuration_errors_percent
+    (run,) = rollout.rollout(Fleet(robot.preset, robot.modules, 1), [setup]).robots()
+    errors = rollout.angle_errors_deg if robot.preset == "pneumatic" else rollout.configuration_errors_percent
     assert errors(run.configuration, desired).mean(axis=0).max() < limit
     at_rest = np.broadcast_to(run.configuration[:1], (61, robot.modules, 3))
     assert errors(at_rest, desired).mean(axis=0).max() > 2 * limit

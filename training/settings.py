@@ -1,4 +1,4 @@
-"""The settings of a training run, with defaults for each kind of robot and for the machine."""
+"""The settings of a training run, with defaults for each drive and for the machine."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 
 from modsoft.runtime.errors import UsageError
 
-# Defaults for each kind of robot: history and batch are those of Table S1. The last modules of a hanging robot are
-# attached to modules that hardly move, so that they serve as examples of a shorter robot; for the cable robot training
-# on them brings no gain.
-BY_KIND: dict[str, dict[str, Any]] = {
-    "cable": {"history": 5, "batch": 64, "truncation_probability": 0.0},
-    "pneumatic": {"history": 10, "batch": 128, "truncation_probability": 0.4},
+# Defaults for each drive: history and batch are those of Table S1. The last modules of a hanging robot are attached to
+# modules that hardly move, so that they serve as examples of a shorter robot; for the cable robot training on them
+# brings no gain.
+BY_DRIVE: dict[str, dict[str, Any]] = {
+    "cables": {"history": 5, "batch": 64, "truncation_probability": 0.0},
+    "chambers": {"history": 10, "batch": 128, "truncation_probability": 0.4},
 }
 CUDA_BATCHES = 4  # a batch on a GPU over one on the CPU: a GPU is idle most of the time with small batches
 PRECISIONS = ("float32", "bfloat16")
@@ -55,8 +55,8 @@ class Settings:
             raise UsageError(f"device {self.device!r}, expected one of {', '.join(DEVICES)}")
 
 
-def settings_for(kind: str, options: dict[str, Any]) -> Settings:
-    """The settings of a run: `options` that are not None, else the defaults for the kind of robot and the device.
+def settings_for(drive: str, options: dict[str, Any]) -> Settings:
+    """The settings of a run: `options` that are not None, else the defaults for the drive of the robot and the device.
 
     `options` have the names of the fields of `Settings`; device "auto" is cuda where there is a GPU. Raises
     `UsageError` for a device or precision that this machine does not have.
@@ -64,7 +64,7 @@ def settings_for(kind: str, options: dict[str, Any]) -> Settings:
     changed = {name: value for name, value in options.items() if value is not None}
     if changed.get("device", "auto") == "auto":
         changed["device"] = "cuda" if torch.cuda.is_available() else "cpu"
-    defaults = dict(BY_KIND[kind])
+    defaults = dict(BY_DRIVE[drive])
     if changed.get("network", "bilstm") != "bilstm":
         defaults["truncation_probability"] = 0.0
     if changed["device"] == "cuda":

@@ -48,7 +48,7 @@ def simulate(robot: Robot, actions: Array) -> dict[str, Array]:
     positions (steps + 1, N, 3), m; directors (steps + 1, N, 3, 3), rows d1, d2, d3. Raises `ModsoftError` if the
     simulation diverges.
     """
-    arms = Arms(robot.kind, robot.modules, 1)
+    arms = Arms(robot.preset, robot.modules, 1)
     (run,) = rollout(arms, actions[:, None], period_s=robot.loop.period_s).robots()
     if not arms.alive[0]:
         step = int(np.isnan(run.configuration).any(axis=(1, 2)).argmax()) - 1

@@ -85,7 +85,7 @@ def _train(
         "schema": checkpoints.SCHEMA,
         "robot": robot,
         "network": description,
-        "features": feature_names(data[0].robot.kind, settings.history),
+        "features": feature_names(data[0].robot.motion, settings.history),
         "weights": fit.best,
         "provenance": identity
         | _of_code_and_data(data)
@@ -154,14 +154,13 @@ def data_sha256(data: Sequence[DataSet]) -> str:
 
 def _robot(data: Sequence[DataSet]) -> dict[str, Any]:
     """The robot file of all data sets, as plain values; `ModelError` where they differ."""
-    robot = data[0].generation["robot"]
     for each in data[1:]:
-        if each.generation["robot"] != robot:
+        if each.robot != data[0].robot:
             raise ModelError(
                 f"data sets of different robots, {data[0].robot.name} and {each.robot.name} (or of one with other "
                 "limits or another rate); a model is trained on data of one robot"
             )
-    return robot
+    return data[0].robot.to_dict()
 
 
 def _finished(out: Path, resume: Path, identity: dict[str, Any], settings: Settings) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def cli(data_files: tuple[Path, ...], out: Path, **options: Any) -> None:
     from modsoft.training.settings import settings_for
 
     data = [dataset.read(path) for path in data_files]
-    settings = settings_for(data[0].robot.kind, options)
+    settings = settings_for(data[0].robot.actuators.drive, options)
     with tqdm(total=100, desc="train", bar_format=BAR, disable=existed) as bar:
         checkpoint = train.train(data, out, settings, _Shown(bar, settings.batch))
     _print_result(checkpoint["provenance"], out, existed)

@@ -45,9 +45,9 @@ def check_board(hello: Hello, robot: Robot, name: str) -> int:
     for chamber in robot.chambers:
         if chamber.channel >= hello.channels:
             raise ProtocolMismatch(
-                f"the robot file puts module {chamber.module} side {chamber.side} on channel {chamber.channel}, "
-                f"the board at {name} has channels 0 to {hello.channels - 1}; correct [[chambers]] or "
-                "CHANNELS_USED in firmware/pins.h"
+                f"the robot file puts the chamber of module {chamber.module} at {chamber.direction_deg:g} degrees on "
+                f"channel {chamber.channel}, the board at {name} has channels 0 to {hello.channels - 1}; correct "
+                "[[chambers]] or CHANNELS_USED in firmware/pins.h"
             )
     return sum(1 << chamber.channel for chamber in robot.chambers)
 

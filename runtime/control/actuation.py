@@ -129,6 +129,6 @@ def channel_pressures_bar(robot: Robot, actuation: Array, channels: int = 12) ->
     pressures, set_points = pressures_bar(robot, actuation).tolist(), [0.0] * channels
     largest_bar = robot.valve.p_max_bar if robot.valve else 0.0
     for chamber in robot.chambers:
-        pressure = pressures[chamber.module - 1]["+-".index(chamber.side)]
+        pressure = pressures[chamber.module - 1][robot.actuator_of(chamber)]
         set_points[chamber.channel] = min(max(chamber.gain * pressure + chamber.offset_bar, 0.0), largest_bar)
     return np.array(set_points)

@@ -34,7 +34,7 @@ class Controller:
         """rest: configuration (N, 3) at the start, where the actuation is 0. correction: a new object, or None."""
         self._robot, self._policy = robot, policy
         self._correction = NoCorrection() if correction is None else correction
-        self._state = state_of(rest, robot.kind)
+        self._state = state_of(rest, robot.motion)
         self.window = Window(policy.history, self._state, robot.action_size)
         self.applied = np.zeros((robot.modules, robot.action_size))
         self.target: Array | None = None  # (N, 3), input of the policy in this step; None without a computation
@@ -48,7 +48,7 @@ class Controller:
         `ModelError` if the policy's output is not finite or far outside [-1, 1].
         """
         if measured is not None:
-            self._state = state_of(measured, self._robot.kind)
+            self._state = state_of(measured, self._robot.motion)
         self.window.observe(self._state)
         if measured is None:
             return self.applied
@@ -75,7 +75,7 @@ class Controller:
         self.window.applied(self.applied)
 
     def _output(self, target: Array) -> Array:
-        return self._policy.actuate(self.window.features(state_of(target, self._robot.kind)))
+        return self._policy.actuate(self.window.features(state_of(target, self._robot.motion)))
 
     def _within_limits(self, raw: Array) -> Array:
         check_actuation(raw)

@@ -1,7 +1,7 @@
 """Module configurations from poses, and the feature layout of the network (`Window`: history, S_d, label of eq. 1).
 
 A configuration is the unit tangent d3 at a module's end, in the frame of the previous module's end (module 1: of the
-base), as [v_x, v_y, v_z]. The state of the network consists of the components that the robot's `Kind` lists.
+base), as [v_x, v_y, v_z]. The state of the network consists of the components that `MOTIONS` lists.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.robot import KINDS
+from modsoft.runtime.layout import MOTIONS
 
 COMPONENTS = ("v_x", "v_y", "v_z")
 REST_LIMIT_DEG = 60.0  # largest bending angle of a module at rest
-_STATE_INDEX = {name: [COMPONENTS.index(component) for component in kind.state] for name, kind in KINDS.items()}
+_STATE_INDEX = {name: [COMPONENTS.index(component) for component in each.state] for name, each in MOTIONS.items()}
 
 
 def from_directors(directors: Array, base: Array | None = None) -> Array:
@@ -65,9 +65,9 @@ def from_angles_deg(angles: Array) -> Array:
     return np.stack([np.sin(radians), np.zeros_like(radians), np.cos(radians)], axis=-1)
 
 
-def state_of(configuration: Array, kind: str) -> Array:
-    """State (..., S) of the network, for a kind of robot, from configurations (..., 3)."""
-    return np.asarray(configuration)[..., _STATE_INDEX[kind]]
+def state_of(configuration: Array, motion: str) -> Array:
+    """State (..., S) of the network, for "planar" or "spatial" motion, from configurations (..., 3)."""
+    return np.asarray(configuration)[..., _STATE_INDEX[motion]]
 
 
 def labels(modules: int) -> Array:
@@ -78,14 +78,14 @@ def labels(modules: int) -> Array:
     return 2.0 * np.arange(modules) / (modules - 1) - 1.0
 
 
-def feature_names(kind: str, history: int) -> list[str]:
+def feature_names(motion: str, history: int) -> list[str]:
     """Names of the F = T (S + A) + 1 features of a module at control step t, in order; history: time steps T."""
     names = []
     for slot in range(history):
         state, action = slot - history + 2, slot - history
         at = "desired" if slot == history - 1 else f"t{state:+d}" if state else "t"
-        names += [f"{name}[{at}]" for name in KINDS[kind].state]
-        names += [f"{name}[t{action:+d}]" for name in KINDS[kind].action]
+        names += [f"{name}[{at}]" for name in MOTIONS[motion].state]
+        names += [f"{name}[t{action:+d}]" for name in MOTIONS[motion].action]
     return [*names, "label"]
 
 

@@ -18,7 +18,8 @@ from modsoft.runtime.control import features, model_file
 from modsoft.runtime.control.model_file import ACTUATION, FEATURES, FROM_NEIGHBOURS, TO_NEIGHBOURS, Description
 from modsoft.runtime.control.ort import onnxruntime, onnxruntime_errors
 from modsoft.runtime.errors import ModelError
-from modsoft.runtime.robot import KINDS, Robot
+from modsoft.runtime.layout import MOTIONS
+from modsoft.runtime.robot import Robot
 
 LARGEST = float(np.finfo(np.float32).max)  # a larger feature becomes infinite in float32
 
@@ -174,17 +175,13 @@ class Model:
     def _check_description(self) -> None:
         """Compares the description with the graph and with the feature layout of this version."""
         description, network = self.description, self.description.network
-        kind = KINDS.get(description.kind)
-        if kind is None:
-            raise ModelError(
-                f"{self.where}: for a robot of kind {description.kind!r}, expected one of {', '.join(KINDS)}"
-            )
+        components = MOTIONS[description.layout.motion]
         pairs = {
             "opset": (description.opset, model_file.OPSET),
             "IR version": (description.ir_version, model_file.IR_VERSION),
             "label": (description.label, model_file.LABEL),
-            "state size": (description.state_size, len(kind.state)),
-            "action size": (description.action_size, len(kind.action)),
+            "state size": (description.state_size, len(components.state)),
+            "action size": (description.action_size, len(components.action)),
             "actuation of the graph": (self.unit.action_size, description.action_size),
             "features of the graph": (self.unit.feature_size, len(description.features)),
             "sequence axis": (description.sequence_axis, network.sequence_axis),
@@ -193,7 +190,7 @@ class Model:
                 network.history,
                 (len(description.features) - 1) // (description.state_size + description.action_size),
             ),
-            "features": (description.features, features.feature_names(description.kind, network.history)),
+            "features": (description.features, features.feature_names(description.layout.motion, network.history)),
         }
         for name, (actual, expected) in pairs.items():
             if actual != expected:
@@ -215,11 +212,13 @@ class Model:
                 )
 
     def check(self, robot: Robot) -> None:
-        """Raises `ModelError` unless the model was trained for this kind of robot and control period, and for this
-        number of modules where the network has a fixed one."""
-        description = self.description
-        pairs = {
-            "kind": (description.kind, robot.kind),
+        """Raises `ModelError` unless the model was trained for this motion, these actuators and this control period,
+        and for this number of modules where the network has a fixed one."""
+        description, layout, other = self.description, self.description.layout, model_file.layout_of(robot)
+        pairs: dict[str, tuple[object, object]] = {
+            "motion": (layout.motion, other.motion),
+            "drive": (layout.drive, other.drive),
+            "directions_deg": (sorted(layout.directions_deg), sorted(other.directions_deg)),
             "state size": (description.state_size, robot.state_size),
             "action size": (description.action_size, robot.action_size),
             "period_s": (description.period_s, robot.loop.period_s),

@@ -18,8 +18,10 @@ from msgspec import Meta
 from modsoft.runtime.choices import NetworkName
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_is_file
+from modsoft.runtime.layout import PRESETS, Actuators
+from modsoft.runtime.robot import Robot
 
-SCHEMA: Literal[1] = 1
+SCHEMA: Literal[2] = 2  # 1: releases 0.1, with the name of a kind of robot in place of the layout
 METADATA_KEY = "modsoft"
 OPSET = 18
 IR_VERSION = 8
@@ -58,6 +60,14 @@ class Network(Record, frozen=True, omit_defaults=True):
         return "modules" if self.name == "bilstm" else "time"
 
 
+class Layout(Record, frozen=True):
+    """Motion and actuators of the robot, as in its file."""
+
+    motion: Literal["planar", "spatial"]
+    drive: Literal["chambers", "cables"]
+    directions_deg: list[float]
+
+
 class Golden(Record, frozen=True):
     """A reference pair that the runtime evaluates at start: features (N, F) and torch's actuation (N, A) for them."""
 
@@ -68,13 +78,13 @@ class Golden(Record, frozen=True):
 class Description(Record, frozen=True):
     """What the model is, which robots it fits and how it was generated."""
 
-    schema: Literal[1]
+    schema: Literal[2]
     file_sha256: str
     weights_sha256: str
     opset: int
     ir_version: int
     sequence_axis: Literal["modules", "time"]
-    kind: str
+    layout: Layout
     state_size: Size
     action_size: Size
     period_s: Positive
@@ -88,15 +98,38 @@ class Description(Record, frozen=True):
     provenance: dict[str, Any]
 
 
+def layout_of(robot: Robot) -> Layout:
+    """Motion and actuators of a robot."""
+    return _layout(robot.motion, robot.actuators)
+
+
+def _layout(motion: str, actuators: Actuators) -> Layout:
+    table = {"motion": motion, **msgspec.to_builtins(actuators)}
+    return msgspec.convert(table, Layout)
+
+
 def describe(text: str, where: str) -> Description:
     """Parses a description, JSON text. `where` names the file in the `ModelError`."""
     try:
-        schema = msgspec.json.decode(text, type=dict).get("schema")
-        if schema != SCHEMA:
-            raise ModelError(f"{where}: description schema {schema!r}, this version reads {SCHEMA}; export it again")
-        return msgspec.json.decode(text, type=Description)
+        table = msgspec.json.decode(text, type=dict)
+        schema = table.get("schema")
+        if schema == 1:
+            table = _from_schema_1(table, where)
+        elif schema != SCHEMA:
+            raise ModelError(
+                f"{where}: description schema {schema!r}, this version reads 1 and {SCHEMA}; export it again"
+            )
+        return msgspec.convert(table, Description)
     except (msgspec.DecodeError, RecursionError) as error:
         raise ModelError(f"{where}: its description cannot be read ({error}); export it again") from error
+
+
+def _from_schema_1(table: dict[str, Any], where: str) -> dict[str, Any]:
+    """A description of schema 1 in the present form."""
+    others, kind = {key: value for key, value in table.items() if key != "kind"}, table.get("kind")
+    if not isinstance(kind, str) or kind not in PRESETS:
+        raise ModelError(f"{where}: for a robot of kind {kind!r}, expected one of {', '.join(PRESETS)}")
+    return {**others, "schema": SCHEMA, "layout": msgspec.to_builtins(_layout(*PRESETS[kind]))}
 
 
 def with_checksum(model: bytes) -> bytes:

@@ -64,20 +64,20 @@ def next_reference(desired: Array) -> Array:
     return np.concatenate([desired[1:], desired[-1:]])
 
 
-def available(kind: str, modules: int) -> list[str]:
-    """Names of the tasks for a kind of robot and a number of modules."""
-    if kind == "cable":
+def available(motion: str, modules: int) -> list[str]:
+    """Names of the tasks for a motion, "planar" or "spatial", and a number of modules."""
+    if motion == "spatial":
         return ["A", "B", "C"]
     return ["edge", "down"] if modules in EDGE_DEG else []
 
 
-def task(name: str, kind: str, modules: int) -> Array:
+def task(name: str, motion: str, modules: int) -> Array:
     """Desired configurations (steps, N, 3), [v_x, v_y, v_z], at the start of each control step. `UsageError` for an
     unknown name."""
-    if name not in available(kind, modules):
-        names = "".join(f"{each}, " for each in available(kind, modules))
+    if name not in available(motion, modules):
+        names = "".join(f"{each}, " for each in available(motion, modules))
         raise UsageError(
-            f"no task {name!r} for a {kind} robot of {modules} modules; expected {names}or a .npy file with "
+            f"no task {name!r} for a {motion} robot of {modules} modules; expected {names}or a .npy file with "
             f"desired configurations (steps, {modules}, 3), [v_x, v_y, v_z]"
         )
     match name:
@@ -106,7 +106,7 @@ def _is_file_name(task: str) -> bool:
 def load_task(name_or_file: str, robot: Robot) -> Array:
     """Loads a task by its name, or from a .npy file of unit vectors (steps, N, 3). `UsageError` for anything else."""
     if not _is_file_name(name_or_file):
-        return task(name_or_file, robot.kind, robot.modules)
+        return task(name_or_file, robot.motion, robot.modules)
     if Path(name_or_file).is_dir():
         raise UsageError(f"task file {name_or_file} is a folder; give a .npy file or a task's name")
     if not Path(name_or_file).is_file():

@@ -63,12 +63,9 @@ def test_full_size(tmp_path, make_checkpoint, robot, history, gain):
 def test_description_is_complete(model):
     description = export(model).description
     stored = checkpoints.load(model)
-    assert (description.kind, description.state_size, description.action_size, description.period_s) == (
-        "pneumatic",
-        2,
-        1,
-        0.4,
-    )
+    layout = description.layout
+    assert (layout.motion, layout.drive, layout.directions_deg) == ("planar", "chambers", [180.0, 0.0])
+    assert (description.state_size, description.action_size, description.period_s) == (2, 1, 0.4)
     assert (description.modules_trained_on, description.network.history) == ([3], 3)
     assert description.features == stored["features"]
     assert description.robot["robot"]["name"] == "pneumatic-3"
@@ -92,8 +89,8 @@ def of(weights, change):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (lambda c: {"features": c["features"][::-1]}, "features .* expected for pneumatic"),
-        (lambda c: {"network": {**c["network"], "history": 4}}, "expected for pneumatic"),
+        (lambda c: {"features": c["features"][::-1]}, "features .* expected for planar"),
+        (lambda c: {"network": {**c["network"], "history": 4}}, "expected for planar"),
         (lambda c: {"network": {**c["network"], "name": "gru"}}, "network: Invalid enum value 'gru'"),
         (lambda c: {"network": {**c["network"], "name": "lstm"}}, "lstm of None modules, expected 3"),
         (lambda c: {"network": {**c["network"], "modules": 3}}, "bilstm of 3 modules, expected None"),

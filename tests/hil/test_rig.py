@@ -71,7 +71,7 @@ def as_in_collection(recorded, run_folder):
     """Configurations at the ticks (K, N, 3) of the robot that training data comes from, given what the run applied."""
     from modsoft.training.simulation.elastica import Arm
 
-    arm = Arm(recorded.robot.kind, recorded.robot.modules)
+    arm = Arm(recorded.robot.preset, recorded.robot.modules)
     arm.step(np.zeros((recorded.robot.modules, 1)))  # the period before the first tick
     there = []
     for tick in read(run_folder).ticks:

@@ -108,14 +108,15 @@ def test_row_20_damaged_model_file_from_the_command_line(matrix_row, full, model
 OTHERS = {
     "state size": (lambda t: t.update(state_size=3), "state size 3", "expected 2"),
     "action size": (lambda t: t.update(action_size=2), "action size 2", "expected 1"),
-    "kind": (lambda t: t.update(kind="wheeled"), "'wheeled'", "expected one of cable, pneumatic"),
+    "motion": (lambda t: t["layout"].update(motion="wheeled"), "'wheeled'", "cannot be read"),
+    "kind": (lambda t: t.update(schema=1, kind="wheeled"), "'wheeled'", "expected one of cable, pneumatic"),
     "history": (lambda t: t["network"].update(history=4), "time steps T 4", "expected 3"),
     "opset": (lambda t: t.update(opset=17), "opset 17", "expected 18"),
     "IR version": (lambda t: t.update(ir_version=9), "IR version 9", "expected 8"),
     "label": (lambda t: t.update(label="tip first"), "tip first", "expected 2 (i - 1) / (N - 1) - 1"),
     "features": (lambda t: t["features"].reverse(), "features ['label'", "expected ['v_x["),
     "feature number": (lambda t: t["features"].pop(), "features of the graph 10", "expected 9"),
-    "schema": (lambda t: t.update(schema=2), "schema 2", "reads 1"),
+    "schema": (lambda t: t.update(schema=3), "schema 3", "reads 1 and 2"),
     "period": (lambda t: t.update(period_s=1.0), "trained for period_s 1.0", "pneumatic-3 has period_s 0.4"),
 }
 
@@ -131,8 +132,14 @@ def test_row_21_model_of_another_robot(matrix_row, make_checkpoint, model_file, 
             assert expected in message, name
         cable = export(make_checkpoint(tmp_path / "cable.pt", "cable-4")).path
         message, _ = refusal(cable, board.port, tmp_path / "runs")
-        assert "trained for kind cable, state size 3, action size 2, period_s 1.0" in message
-        assert "has kind pneumatic, state size 2, action size 1, period_s 0.4" in message
+        assert (
+            "trained for motion spatial, drive cables, directions_deg [0.0, 90.0, 180.0, 270.0], state size 3"
+            in message
+        )
+        assert (
+            "has motion planar, drive chambers, directions_deg [0.0, 180.0], state size 2, action size 1, period_s 0.4"
+            in message
+        )
         assert untouched(board)
     matrix_row(
         21,

@@ -178,6 +178,19 @@ def test_three_chambers_reach_the_hexagon():
     np.testing.assert_allclose(np.hypot(*corners.T), [1.0] * 6 + [np.sqrt(0.75)], atol=1e-12)
 
 
+def test_set_points_of_three_chambers_a_module():
+    table = ROBOT.to_dict()
+    table["robot"]["motion"] = "spatial"
+    table["actuators"]["directions_deg"] = [0, 120, 240]
+    table["simulation"] = None
+    table["chambers"] = [{"module": i // 3 + 1, "direction_deg": i % 3 * 120, "channel": 8 - i} for i in range(9)]
+    out = actuation.channel_pressures_bar(robot_file.from_dict(table), np.array([[-1.0, 0.0], [0.5, 0.0], [0.0, 0.0]]))
+    expected = np.full(12, 0.08)
+    expected[[8, 4, 3]] = [0.35, 0.215, 0.215]  # away from the chamber at 0, then towards it
+    expected[9:] = 0.0
+    np.testing.assert_allclose(out, expected, atol=1e-12)
+
+
 @pytest.mark.parametrize("step", [0.05, 0.4, 2.0])
 def test_limits_of_three_chambers_hold_together(step):
     actuators, rng, previous = actuation.ModuleActuators(THREE), np.random.default_rng(1), np.zeros((50, 2))

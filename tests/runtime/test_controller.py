@@ -37,9 +37,9 @@ def test_step_uses_the_next_desired_configuration_and_limits_the_output():
     np.testing.assert_array_equal(actuation, [[0.5], [0.8], [-0.8]])
     np.testing.assert_array_equal(controller.target, NEXT)
     np.testing.assert_array_equal(controller.raw, policy.output)
-    window = Window(4, state_of(REST, "pneumatic"), 1)
-    window.observe(state_of(measured, "pneumatic"))
-    np.testing.assert_array_equal(policy.features[0], window.features(state_of(NEXT, "pneumatic")))
+    window = Window(4, state_of(REST, "planar"), 1)
+    window.observe(state_of(measured, "planar"))
+    np.testing.assert_array_equal(policy.features[0], window.features(state_of(NEXT, "planar")))
     np.testing.assert_array_equal(controller.applied, np.zeros((3, 1)))  # until it is recorded
     controller.record(actuation)
     np.testing.assert_array_equal(controller.applied, actuation)
@@ -76,12 +76,12 @@ def test_state_and_actuation_are_held_without_a_measurement(cause):
     assert len(policy.features) == 1
     np.testing.assert_array_equal(controller.applied, policy.output)
     controller.compute(REST, REST, NEXT)
-    window = Window(4, state_of(REST, "pneumatic"), 1)
+    window = Window(4, state_of(REST, "planar"), 1)
     for _ in range(2):
-        window.observe(state_of(first, "pneumatic"))
+        window.observe(state_of(first, "planar"))
         window.applied(policy.output)
-    window.observe(state_of(REST, "pneumatic"))
-    np.testing.assert_array_equal(policy.features[1], window.features(state_of(NEXT, "pneumatic")))
+    window.observe(state_of(REST, "planar"))
+    np.testing.assert_array_equal(policy.features[1], window.features(state_of(NEXT, "planar")))
 
 
 def test_actuation_that_was_not_sent_is_not_recorded():

@@ -29,7 +29,7 @@ OFFSET = np.array([[0.05, 0, 0], [0, -0.04, 0.01], [0.02, 0.03, 0], [-0.06, 0.02
 
 
 def test_constant_error_is_removed():
-    desired = task("A", "cable", 4)
+    desired = task("A", "spatial", 4)
     alone = errors_percent(NoCorrection(), desired, OFFSET)
     corrected = errors_percent(IntegralCorrection(4), desired, OFFSET)
     assert alone[20:].min() > 2.0
@@ -37,7 +37,7 @@ def test_constant_error_is_removed():
 
 
 def test_reference_is_unchanged_without_an_error():
-    desired = task("A", "cable", 4)
+    desired = task("A", "spatial", 4)
     assert errors_percent(IntegralCorrection(4), desired, 0 * OFFSET).max() < 1e-10
 
 

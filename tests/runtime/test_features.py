@@ -51,9 +51,9 @@ def test_batched_directors_equal_single_ones():
     np.testing.assert_array_equal(c.from_directors(directors), np.stack([c.from_directors(d) for d in directors]))
 
 
-def test_state_order_follows_the_kind():
-    assert np.array_equal(c.state_of(np.array([1.0, 2.0, 3.0]), "cable"), [3, 1, 2])
-    assert np.array_equal(c.state_of(np.array([1.0, 2.0, 3.0]), "pneumatic"), [1, 2])
+def test_state_order_follows_the_motion():
+    assert np.array_equal(c.state_of(np.array([1.0, 2.0, 3.0]), "spatial"), [3, 1, 2])
+    assert np.array_equal(c.state_of(np.array([1.0, 2.0, 3.0]), "planar"), [1, 2])
 
 
 def test_labels():
@@ -65,7 +65,7 @@ def test_labels():
 
 def test_feature_order_by_name():
     """Each feature has the value that its name describes."""
-    history, modules, kind = 5, 3, "cable"
+    history, modules = 5, 3
     step = 40
     # 1000 * step + 10 * module + component: unique for each entry
     states = {t: np.array([[1000 * t + 10 * i + s for s in (1, 2, 3)] for i in range(modules)]) for t in range(60)}
@@ -76,7 +76,7 @@ def test_feature_order_by_name():
         window.applied(actions[t])
     window.observe(states[step])
     rows = window.features(states[step + 1])
-    names = c.feature_names(kind, history)
+    names = c.feature_names("spatial", history)
     assert rows.shape == (modules, len(names)) == (3, 5 * 5 + 1)
     order = {"v_z": 1, "v_x": 2, "v_y": 3, "a_0": 4, "a_1": 5}
     for i in range(modules):

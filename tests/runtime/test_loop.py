@@ -61,12 +61,12 @@ def test_the_model_gets_the_window_that_training_makes():
     answers = iter(np.linspace(0.05, 0.3, 6))
     world.answer = lambda features: np.full((3, 1), next(answers))
     world.run()
-    window = Window(3, state_of(REST, "pneumatic"), 1)
+    window = Window(3, state_of(REST, "planar"), 1)
     for k, given_features in enumerate(world.features):
-        window.observe(state_of(world.ticks[k].configuration, "pneumatic"))
+        window.observe(state_of(world.ticks[k].configuration, "planar"))
         # asked for is the state at the end of the period, which is desired at the start of the next
         due = world.loop.desired[min(k + 1, 5)]
-        np.testing.assert_allclose(given_features, window.features(state_of(due, "pneumatic")), atol=1e-12)
+        np.testing.assert_allclose(given_features, window.features(state_of(due, "planar")), atol=1e-12)
         window.applied(world.ticks[k].actuation)
 
 
@@ -422,19 +422,19 @@ def test_whatever_happens_the_model_sees_what_an_episode_of_training_has(happens
     except (Tripped, LostInRun):
         pass  # three in a row: what came before is looked at
     # as an episode, the period at actuation 0 before step 0 included; the slots that nothing came of are held
-    states, actions = [state_of(REST, "pneumatic")], [np.zeros((3, 1))]
+    states, actions = [state_of(REST, "planar")], [np.zeros((3, 1))]
     for record in world.ticks:
         for _ in range(record.missed):
             states.append(states[-1])
             actions.append(actions[-1])
         good = record.configuration is not None
-        states.append(state_of(record.configuration, "pneumatic") if good else states[-1])
+        states.append(state_of(record.configuration, "planar") if good else states[-1])
         actions.append(record.actuation)
     rows = episode_features(np.array([*states, states[-1]]), np.array(actions), world.history)
-    desired = [name.endswith("[desired]") for name in feature_names("pneumatic", world.history)]
+    desired = [name.endswith("[desired]") for name in feature_names("planar", world.history)]
     asked = [record for record in world.ticks if record.raw is not None]
     assert len(asked) == len(world.features)
     for record, found in zip(asked, world.features, strict=True):
         row = rows[record.tick + 1]
-        row[:, desired] = state_of(record.reference, "pneumatic")
+        row[:, desired] = state_of(record.reference, "planar")
         np.testing.assert_allclose(found, row, atol=1e-12)

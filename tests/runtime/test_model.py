@@ -75,7 +75,7 @@ def test_wrong_shapes_are_refused(model, shape):
 
 def test_check_names_the_differences(model):
     model.check(robot_file.load("pneumatic-3"))
-    with pytest.raises(ModelError, match=r"kind pneumatic, state size 2, action size 1, .*cable-4 has kind cable"):
+    with pytest.raises(ModelError, match=r"motion planar, drive chambers, .*cable-4 has motion spatial"):
         model.check(robot_file.load("cable-4"))
     text = robot_file.text_of("pneumatic-3")
     slow = robot_file.parse(text.replace("hz = 2.5", "hz = 2.0"))
@@ -132,11 +132,14 @@ def test_missing_file_is_an_error(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.update(schema=2), "schema 2, this version reads 1"),
+        (lambda t: t.update(schema=3), "schema 3, this version reads 1 and 2"),
         (lambda t: t.update(colour="red"), "colour"),
         (lambda t: t.pop("features"), "features"),
-        (lambda t: t.update(kind="wheeled"), "kind 'wheeled'"),
-        (lambda t: t.update(kind="cable"), "state size 2, expected 3"),
+        (lambda t: t["layout"].update(motion="wheeled"), "wheeled"),
+        (lambda t: t["layout"].update(motion="spatial"), "state size 2, expected 3"),
+        (lambda t: t.update(schema=1), "kind None, expected one of cable, pneumatic"),
+        (lambda t: t.update(schema=1, kind="wheeled"), "kind 'wheeled', expected one of cable, pneumatic"),
+        (lambda t: t.update(schema=1, kind="cable"), "state size 2, expected 3"),
         (lambda t: t.update(label="tip first"), "label"),
         (lambda t: t.update(opset=17), "opset 17, expected 18"),
         (lambda t: t["features"].reverse(), "features"),
@@ -153,6 +156,25 @@ def test_missing_file_is_an_error(tmp_path):
 def test_wrong_description_is_refused(model_file, tmp_path, change, message):
     with pytest.raises(ModelError, match=message):
         Model.load(with_description_changed(model_file, tmp_path / "model.onnx", change))
+
+
+def test_description_of_schema_1_is_read(model_file, tmp_path):
+    """Releases 0.1 wrote the name of a kind of robot in place of the layout."""
+
+    def to_schema_1(table):
+        del table["layout"]
+        table.update(schema=1, kind="pneumatic")
+
+    old = Model.load(with_description_changed(model_file, tmp_path / "model.onnx", to_schema_1)).description
+    assert old.layout == Model.load(model_file).description.layout
+
+
+def test_robot_with_other_actuators_is_refused(model):
+    text = robot_file.text_of("pneumatic-3").replace("[simulation]\npreset", "#").replace("[180, 0]", "[0, 180]")
+    model.check(robot_file.parse(text))  # in another order
+    cables = text.split("[valve]")[0].replace('"chambers"', '"cables"') + "[limits]\nslew_bar_per_s = 1.0\n"
+    with pytest.raises(ModelError, match=r"trained for drive chambers; robot pneumatic-3 has drive cables"):
+        model.check(robot_file.parse(cables))
 
 
 def test_valid_copy_is_loaded(model_file, tmp_path):

@@ -1,8 +1,11 @@
 """The robot file: shipped robots, parsing, and the message of every error."""
 
 import dataclasses
+import math
+import re
 
 import msgspec
+import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robot_file
@@ -10,7 +13,7 @@ from modsoft.runtime.errors import RobotFileError
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "modules", "state", "action"),
+    ("name", "preset", "modules", "state", "action"),
     [
         ("cable-4", "cable", 4, 3, 2),
         ("cable-6", "cable", 6, 3, 2),
@@ -18,9 +21,9 @@ from modsoft.runtime.errors import RobotFileError
         ("pneumatic-3", "pneumatic", 3, 2, 1),
     ],
 )
-def test_shipped_robots(name, kind, modules, state, action):
+def test_shipped_robots(name, preset, modules, state, action):
     robot = robot_file.load(name)
-    assert (robot.name, robot.kind, robot.modules) == (name, kind, modules)
+    assert (robot.name, robot.preset, robot.modules) == (name, preset, modules)
     assert (robot.state_size, robot.action_size) == (state, action)
 
 
@@ -67,6 +70,44 @@ def test_robot_is_frozen():
 
 
 PNEUMATIC = robot_file.text_of("pneumatic-3")
+CABLE = robot_file.text_of("cable-4")
+# A spatial robot with chambers, which has no preset.
+THREE = re.sub(r"\[simulation\]\n.*\n", "", PNEUMATIC.split("[[chambers]]")[0])
+THREE = THREE.replace('"planar"', '"spatial"').replace("[180, 0]", "[0, 120, 240]")
+THREE += "\n".join(
+    f"[[chambers]]\nmodule = {i // 3 + 1}\ndirection_deg = {i % 3 * 120}\nchannel = {i}" for i in range(9)
+)
+
+
+def version_0_1(text):
+    """A robot file with `kind` in place of motion, actuators and preset, as version 0.1 wrote it."""
+    kind = "cable" if 'drive = "cables"' in text else "pneumatic"
+    text = re.sub(r"\[actuators\](.*\n)*?(?=\[loop\])", "", text)
+    text = re.sub(r"motion = .*", f'kind = "{kind}"', text)
+    return text.replace("direction_deg = 180", 'side = "+"').replace("direction_deg = 0", 'side = "-"')
+
+
+@pytest.mark.parametrize("name", robot_file.names())
+def test_file_of_version_0_1_is_the_same_robot(name):
+    old = version_0_1(robot_file.text_of(name))
+    assert "kind = " in old
+    assert "_deg" not in old
+    assert robot_file.parse(old) == robot_file.load(name)
+
+
+def test_robot_with_three_chambers_a_module():
+    robot = robot_file.parse(THREE)
+    assert (robot.motion, robot.state_size, robot.action_size, len(robot.chambers)) == ("spatial", 3, 2, 9)
+    half = math.sqrt(0.75)
+    np.testing.assert_allclose(robot.directions, [[-1, 0], [0.5, -half], [0.5, half]], atol=1e-15)
+    assert [robot.actuator_of(chamber) for chamber in robot.chambers] == [0, 1, 2] * 3
+    with pytest.raises(RobotFileError, match=r"no \[simulation\], expected one"):
+        robot.preset  # noqa: B018
+
+
+def test_cables_pull_and_chambers_push():
+    assert np.array_equal(robot_file.load("cable-4").directions, [[1, 0], [-1, 0], [0, 1], [0, -1]])
+    assert np.array_equal(robot_file.load("pneumatic-3").directions, [[1], [-1]])
 
 
 @pytest.mark.parametrize(
@@ -76,9 +117,39 @@ PNEUMATIC = robot_file.text_of("pneumatic-3")
         (PNEUMATIC.replace("hz = 2.5", 'hz = "fast"'), r"hz under \[loop\]: found 'fast'; expected a number above 0"),
         (PNEUMATIC.replace("hz = 2.5", "hz = 0.0"), r"hz under \[loop\]: found 0.0; .* above 0 and at most 100$"),
         (
-            PNEUMATIC.replace('"pneumatic"', '"pneumatics"'),
-            r"kind under \[robot\]: found 'pneumatics', did you mean 'pneumatic'\?; .* one of 'cable', 'pneumatic'$",
+            version_0_1(PNEUMATIC).replace('"pneumatic"', '"pneumatics"'),
+            r"kind under \[robot\]: found 'pneumatics', did you mean 'pneumatic'\?; .* one of 'cable', 'pneumatic'; or",
         ),
+        (version_0_1(PNEUMATIC).replace('kind = "pneumatic"', "kind = []"), r"found \[\]; expected one of 'cable'"),
+        (
+            PNEUMATIC.replace("motion", 'kind = "pneumatic"\nmotion', 1),
+            r"kind under \[robot\], and \[act.* delete kind",
+        ),
+        (
+            version_0_1(PNEUMATIC).replace('side = "+"', 'side = "left"', 1),
+            r"unknown key 'side' under \[chambers number 1\]; .* direction_deg",
+        ),
+        (PNEUMATIC.replace('"planar"', '"plane"'), r"motion under .* did you mean 'planar'\?; .* 'planar', 'spatial'$"),
+        (PNEUMATIC.replace("directions_deg = [180, 0]", ""), r"directions_deg under \[actuators\] is missing; add it"),
+        (PNEUMATIC.replace("[180, 0]", "[180, 360]"), r"directions_deg number 2 .* found 360; .* below 360$"),
+        (PNEUMATIC.replace("[180, 0]", "[180, nan]"), r"directions_deg number 2 .* found nan; .* below 360$"),
+        (PNEUMATIC.replace("[180, 0]", "[180, 180]"), r"directions_deg under \[actuators\]: found 180 twice; expected"),
+        (PNEUMATIC.replace("[180, 0]", "[180]"), "found 180 for a planar robot; expected 0 and 180"),
+        (PNEUMATIC.replace("[180, 0]", "[]"), "found none for a planar robot; expected 0 and 180"),
+        (PNEUMATIC.replace("[180, 0]", "[180, 0, 90]"), 'found 180, 0, 90 for a planar robot; .* motion = "spatial"'),
+        (
+            PNEUMATIC.replace('"planar"', '"spatial"'),
+            "found 180, 0, 180 degrees from 180 to the next; expected at most",
+        ),
+        (THREE.replace("[0, 120, 240]", "[]"), "found none; expected at most 170 degrees"),
+        (THREE.replace("[0, 120, 240]", "[7]"), "found 7, 360 degrees from 7 to the next; expected at most 170"),
+        (THREE.replace("[0, 120, 240]", "[0, 10, 170]"), "190 degrees from 170 to the next; .* add an actuator"),
+        (
+            THREE.replace("[0, 120, 240]", "[0, 120, 250]"),
+            "missing: .* 3 at 250; too many: .* 3 at 240 degrees; .* 0, 120",
+        ),
+        (THREE.replace("[loop]", '[simulation]\npreset = "cable"\n[loop]'), "'cable' .* with chambers at 0, 120, 240"),
+        (PNEUMATIC.replace("[180, 0]", "[0, 180]"), "chambers at 0, 180 degrees; expected a planar one .* at 180, 0"),
         (PNEUMATIC.replace('"0-10 V"', '"4-20 mA"'), r"signal under \[valve\]: found '4-20 mA'; expected '0-10 V'$"),
         (PNEUMATIC.replace("baud = 250000", "baud = 9600"), "found 9600; expected one of 115200, 250000"),
         (
@@ -86,8 +157,8 @@ PNEUMATIC = robot_file.text_of("pneumatic-3")
             r"modules under \[robot\]: found 1; .* at least 2 and at most 64$",
         ),
         (PNEUMATIC.replace('name = "pneumatic-3"', 'name = "my arm"'), "found 'my arm'; expected text"),
-        (PNEUMATIC.replace("modules = 3", "modules = 2"), "too many: module 3 side [+], module 3 side -; expected"),
-        (PNEUMATIC.replace("modules = 3", "modules = 4"), "missing: module 4 side [+], module 4 side -; expected"),
+        (PNEUMATIC.replace("modules = 3", "modules = 2"), "too many: module 3 at 0, module 3 at 180 degrees; expected"),
+        (PNEUMATIC.replace("modules = 3", "modules = 4"), "missing: module 4 at 0, module 4 at 180 degrees; expected"),
         (PNEUMATIC.replace("tools = []", "tools = [1]"), r"tools number 1 under \[tracker\]: found 1; expected text"),
         (PNEUMATIC.replace("tools = []", "tools = 7"), r"tools under \[tracker\]: found 7; expected a list$"),
         (
@@ -112,10 +183,10 @@ PNEUMATIC = robot_file.text_of("pneumatic-3")
         (PNEUMATIC.replace("[robot]", "[robot"), "not valid TOML"),
         (PNEUMATIC + '\n[colour]\npaint = "red"\n', "colour"),
         (
-            robot_file.text_of("cable-4") + '\n[valve]\nmodel = "x"\nfull_scale_bar = 3.0\nsignal = "0-10 V"\n',
+            CABLE + '\n[valve]\nmodel = "x"\nfull_scale_bar = 3.0\nsignal = "0-10 V"\n',
             "simulated",
         ),
-        (robot_file.text_of("cable-4").replace('"cable"', '"pneumatic"'), "full_scale_bar"),
+        (version_0_1(CABLE).replace('"cable"', '"pneumatic"'), "full_scale_bar"),
     ],
 )
 def test_every_error_is_one_line_that_names_the_key(text, expected):

@@ -9,30 +9,30 @@ from modsoft.runtime.errors import UsageError
 
 
 @pytest.mark.parametrize(
-    ("kind", "modules"),
-    [*(("cable", modules) for modules in (2, 3, 4, 5, 6, 8, 12, 64)), ("pneumatic", 2), ("pneumatic", 3)],
+    ("motion", "modules"),
+    [*(("spatial", modules) for modules in (2, 3, 4, 5, 6, 8, 12, 64)), ("planar", 2), ("planar", 3)],
 )
-def test_tasks_are_unit_vectors(kind, modules):
-    for name in tasks.available(kind, modules):
-        desired = tasks.task(name, kind, modules)
-        assert desired.shape == (250 if kind == "cable" else 200, modules, 3)
+def test_tasks_are_unit_vectors(motion, modules):
+    for name in tasks.available(motion, modules):
+        desired = tasks.task(name, motion, modules)
+        assert desired.shape == (250 if motion == "spatial" else 200, modules, 3)
         np.testing.assert_allclose(np.linalg.norm(desired, axis=-1), 1.0, atol=1e-12)
 
 
 def test_task_a_starts_straight_and_keeps_bending():
-    desired = tasks.task("A", "cable", 4)
+    desired = tasks.task("A", "spatial", 4)
     np.testing.assert_allclose(desired[0], [[0, 0, 1]] * 4, atol=1e-12)
     np.testing.assert_allclose(desired[125, 3], [0.0, -np.sqrt(1 - 0.8125**2), 0.8125], atol=1e-12)
 
 
 def test_task_b_holds_v_z_and_the_tip_turns_against_the_others():
-    desired = tasks.task("B", "cable", 4)
+    desired = tasks.task("B", "spatial", 4)
     np.testing.assert_allclose(desired[:, :, 2], np.broadcast_to([0.998, 0.998, 0.996, 0.6], (250, 4)))
     assert np.sign(desired[0, :, 1]).tolist() == [1, 1, 1, -1]
 
 
 def test_task_c_bends_in_y_then_turns():
-    desired = tasks.task("C", "cable", 6)
+    desired = tasks.task("C", "spatial", 6)
     np.testing.assert_allclose(desired[:51, :, 0], 0, atol=1e-12)
     np.testing.assert_allclose(desired[50, :, 2], [0.999, 0.996, 0.985, 0.975, 0.925, 0.600])
     np.testing.assert_allclose(desired[100, 5, 0], -0.8, atol=1e-12)  # a quarter turn, a = -1
@@ -82,7 +82,7 @@ def test_tip_stays_near_the_axis_in_task_b_and_upright_in_task_c(modules):
 
 @pytest.mark.parametrize(("modules", "largest"), [(3, [3.6, 36.0, -39.6]), (2, [32.4, -32.4])])
 def test_down_is_the_triangle_of_s5(modules, largest):
-    angles = features.bending_angle_deg(tasks.task("down", "pneumatic", modules))
+    angles = features.bending_angle_deg(tasks.task("down", "planar", modules))
     for step, fraction in [(0, 0), (25, 0.5), (50, 1), (100, 0), (150, -1), (175, -0.5)]:
         np.testing.assert_allclose(angles[step], fraction * np.array(largest), atol=1e-9)
     np.testing.assert_allclose(angles.sum(axis=1), 0, atol=1e-9)
@@ -95,9 +95,9 @@ def test_unknown_task_is_refused_with_the_names():
 
 def test_task_is_loaded_from_a_file(tmp_path):
     path = tmp_path / "task.npy"
-    np.save(path, tasks.task("edge", "pneumatic", 2))
+    np.save(path, tasks.task("edge", "planar", 2))
     loaded = tasks.load_task(str(path), robot_file.load("pneumatic-2"))
-    assert np.array_equal(loaded, tasks.task("edge", "pneumatic", 2))
+    assert np.array_equal(loaded, tasks.task("edge", "planar", 2))
     with pytest.raises(UsageError, match=r"expected \(steps, 3, 3\)"):
         tasks.load_task(str(path), robot_file.load("pneumatic-3"))
 

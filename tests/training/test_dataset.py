@@ -77,8 +77,7 @@ def test_windows_equal_those_of_the_control_loop(kind):
     data = make(1, 240, kind)
     history = 5
     training, _, _ = d.split(data, history, "blocks", 0)
-    name = data.robot.kind
-    states = state_of(data.configuration[0], name)
+    states = state_of(data.configuration[0], data.robot.motion)
     window = Window(history, states[0], data.robot.action_size)
     seen = {}
     for t, action in enumerate(data.action[0]):

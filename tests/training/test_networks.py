@@ -79,7 +79,7 @@ def test_module_lstm_uses_only_its_module_and_shares_no_weight():
 @pytest.mark.parametrize("name", ["lstm", "module-lstm"])
 def test_bound_networks_do_not_use_the_label(name):
     x, _, _ = windows()
-    assert feature_names("cable", T)[-1] == "label"
+    assert feature_names("spatial", T)[-1] == "label"
     assert not heard(built(name), x)[..., -1].any()
     assert heard(built("bilstm"), x)[..., -1].any()
 

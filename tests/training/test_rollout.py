@@ -45,12 +45,12 @@ def desired_columns(kind: str, history: int) -> list[int]:
 
 
 def inverse(features: np.ndarray) -> np.ndarray:
-    v_x = features[:, desired_columns("pneumatic", 4)[0]]
+    v_x = features[:, desired_columns("planar", 4)[0]]
     return np.degrees(np.arcsin(v_x))[:, None] / FULL_DEG
 
 
 def setup(task: str, actuate=inverse, **options) -> ControllerSetup:
-    return ControllerSetup(PNEUMATIC_3, actuate, 4, tasks.task(task, "pneumatic", 3), **options)
+    return ControllerSetup(PNEUMATIC_3, actuate, 4, tasks.task(task, "planar", 3), **options)
 
 
 def test_given_actions_are_applied_and_every_state_is_recorded():
@@ -86,7 +86,7 @@ def test_controller_of_a_diverged_robot_holds_its_actuation_and_the_others_conti
 
 
 def test_inverse_of_the_robot_follows_the_task_without_delay():
-    desired = tasks.task("edge", "pneumatic", 3)
+    desired = tasks.task("edge", "planar", 3)
     simulator = RobotsOfAngles(3)
     (run,) = rollout(simulator, [setup("edge")]).robots()
     assert simulator.periods_s == {PNEUMATIC_3.loop.period_s}
@@ -115,10 +115,10 @@ def test_features_are_those_of_the_runtime_and_the_largest_step_is_kept():
     np.testing.assert_allclose(run.actions[:, 0, 0], np.minimum(1.0, largest * np.arange(1, 6)))
     np.testing.assert_allclose(run.actions[:, 1, 0], -0.3)
     np.testing.assert_array_equal(np.stack(simulator.applied)[:, 0], run.actions)
-    names = feature_names("pneumatic", 4)
+    names = feature_names("planar", 4)
     for k, features in enumerate(seen):
         np.testing.assert_array_equal(
-            features[:, desired_columns("pneumatic", 4)], state_of(desired[min(k + 1, 4)], "pneumatic"), strict=True
+            features[:, desired_columns("planar", 4)], state_of(desired[min(k + 1, 4)], "planar"), strict=True
         )
         np.testing.assert_array_equal(features[:, names.index("v_x[t]")], run.configuration[k][:, 0])
         # The applied actuation, not the output of the policy.
@@ -148,7 +148,7 @@ def test_correction_removes_a_constant_error_of_the_policy():
         return inverse(features) + 0.03
 
     # Task "down" stays within 90 degrees, where v_x determines the angle.
-    desired = tasks.task("down", "pneumatic", 3)
+    desired = tasks.task("down", "planar", 3)
     setups = [setup("down", biased), setup("down", biased, correction=correction.by_name("integral", 3))]
     alone, corrected = rollout(RobotsOfAngles(3, 2), setups).robots()
     np.testing.assert_allclose(r.angle_errors_deg(alone.configuration, desired)[1:], 3.0, atol=1e-6)

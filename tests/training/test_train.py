@@ -50,7 +50,7 @@ def test_network_learns_and_the_checkpoint_describes_the_run(tmp_path):
     assert list(tmp_path.iterdir()) == [out]
     trained = checkpoints.load(out)
     assert robot_file.from_dict(trained["robot"]) == data.robot
-    assert trained["features"] == feature_names("pneumatic", 3)
+    assert trained["features"] == feature_names("planar", 3)
     assert trained["network"]["history"] == 3
     assert trained["provenance"]["data_sha256"] == data.sha256()
     assert trained["provenance"]["samples"] == 600
@@ -98,7 +98,7 @@ def test_bfloat16_products_train_as_well(tmp_path):
 def test_precision_or_device_that_the_machine_does_not_have_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(settings, "bfloat16_works", lambda device: False)
     with pytest.raises(UsageError, match="precision bfloat16: this machine has no units for it; give --precision"):
-        settings.settings_for("cable", {"precision": "bfloat16"})
+        settings.settings_for("cables", {"precision": "bfloat16"})
     assert settings.fastest_precision() == "float32"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UsageError, match="device cuda: torch finds no GPU"):
@@ -108,11 +108,11 @@ def test_precision_or_device_that_the_machine_does_not_have_is_refused(monkeypat
 
 def test_default_device_is_the_gpu_where_there_is_one(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert settings.settings_for("cable", {"device": "auto", "learning_rate": None}) == Settings(5, batch=64)
+    assert settings.settings_for("cables", {"device": "auto", "learning_rate": None}) == Settings(5, batch=64)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    chosen = settings.settings_for("pneumatic", {"device": "auto"})
+    chosen = settings.settings_for("chambers", {"device": "auto"})
     assert (chosen.device, chosen.batch, chosen.truncation_probability) == ("cuda", 512, 0.4)
-    chosen = settings.settings_for("pneumatic", {"device": "cpu", "network": "lstm", "history": 7})
+    chosen = settings.settings_for("chambers", {"device": "cpu", "network": "lstm", "history": 7})
     assert (chosen.device, chosen.batch, chosen.truncation_probability, chosen.history) == ("cpu", 128, 0.0, 7)
 
 

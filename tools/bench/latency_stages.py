@@ -62,7 +62,7 @@ def robot_of(modules: int, hz: float) -> Robot:
     table["robot"] |= {"modules": modules, "name": f"pneumatic-{modules}"}
     table["loop"] |= {"hz": hz, "task": ""}
     table["chambers"] = [
-        {**table["chambers"][0], "module": channel // 2 + 1, "side": "+-"[channel % 2], "channel": channel}
+        {**table["chambers"][0], "module": channel // 2 + 1, "direction_deg": [180, 0][channel % 2], "channel": channel}
         for channel in range(2 * modules)
     ]
     return robot_file.from_dict(table, f"pneumatic-{modules}")

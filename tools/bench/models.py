@@ -30,13 +30,13 @@ QUICK_STEPS = 20
 def measured(name: str, robot_name: str, steps: int | None) -> list[dict[str, Any]]:
     """A row for each task and correction. steps: of each task; None for all."""
     robot, model = robot_file.load(robot_name), Model.load(MODELS / f"{name}.onnx")
-    cases = [(task, each) for task in tasks.available(robot.kind, robot.modules) for each in CORRECTIONS]
+    cases = [(task, each) for task in tasks.available(robot.motion, robot.modules) for each in CORRECTIONS]
     setups = [
         ControllerSetup(
             robot,
             model.actuate,
             model.history,
-            tasks.task(task, robot.kind, robot.modules)[:steps],
+            tasks.task(task, robot.motion, robot.modules)[:steps],
             correction.by_name(each, robot.modules),
         )
         for task, each in cases
@@ -44,9 +44,9 @@ def measured(name: str, robot_name: str, steps: int | None) -> list[dict[str, An
     errors_of, unit = {
         "pneumatic": (angle_errors_deg, "degrees"),
         "cable": (configuration_errors_percent, "percent"),
-    }[robot.kind]
+    }[robot.preset]
     rows = []
-    rollouts = rollout(simulated(robot.kind, robot.modules, len(setups)), setups).robots()
+    rollouts = rollout(simulated(robot.preset, robot.modules, len(setups)), setups).robots()
     for (task, each), setup, motion in zip(cases, setups, rollouts, strict=True):
         mean = errors_of(motion.configuration, setup.desired).mean(axis=0)
         row = {"model": name, "robot": robot_name, "task": task, "correction": each, "unit": unit}

@@ -28,7 +28,7 @@ from modsoft.training.data import dataset
 from modsoft.training.data.dataset import DataSet, Windows
 from modsoft.training.fit import estimation_errors
 from modsoft.training.networks import BiLSTM
-from modsoft.training.settings import BY_KIND, Settings
+from modsoft.training.settings import BY_DRIVE, Settings
 
 ADAM_ITERATIONS = 4  # times ours: with as many as ours the learning rate reaches zero far above the target
 # Windows, robot, and the largest fraction of the optimizer in a training step that is acceptable with AVX2.
@@ -92,7 +92,7 @@ class Adam(torch.optim.Adam):
 def ours(race: Race, data: DataSet) -> None:
     """modsoft-train without its command line."""
     settings = Settings(
-        **BY_KIND[data.robot.kind] | {"split": "shuffled", "batch": race.batch},
+        **BY_DRIVE[data.robot.actuators.drive] | {"split": "shuffled", "batch": race.batch},
         iterations=race.iterations,
         layers=race.layers,
         hidden=race.hidden,
@@ -127,7 +127,7 @@ def authors(race: Race, data: DataSet) -> None:
     """The training of the paper, without an end."""
     torch.set_num_threads(1)
     torch.manual_seed(race.seed)
-    history = BY_KIND[data.robot.kind]["history"]
+    history = BY_DRIVE[data.robot.actuators.drive]["history"]
     training, validation, _ = dataset.split(data, history, "shuffled", race.seed)
     network = BiLSTM(training.features.shape[-1], training.targets.shape[-1], race.layers, race.hidden, dropout=0.1)
     adam_optimizer = torch.optim.Adam(network.parameters(), lr=0.001)
@@ -155,7 +155,7 @@ def step_times(rounds: int) -> list[dict[str, Any]]:
     rows = []
     for batch, name, target_share in STEPS:
         robot = robot_file.load(name)
-        history = BY_KIND[robot.kind]["history"]
+        history = BY_DRIVE[robot.actuators.drive]["history"]
         sizes = {"feature_size": history * (robot.state_size + robot.action_size) + 1, "action_size": robot.action_size}
         network = networks.build({"name": "bilstm", "layers": 4, "hidden": 128, **sizes})
         muon_and_adam = optimizer.MuonAndAdam(network)

@@ -59,12 +59,12 @@ class PneumaticArm(Protocol):
 
 
 def set_points_bar(robot: Robot, duty: Array) -> Array:
-    """Set-points of the chambers (N, 2), sides + and -, bar, from the duty of each valve channel (channels,)."""
+    """Set-points of the chambers (N, n), bar, in the order of the actuators, from the valves' duties (channels,)."""
     assert robot.valve is not None  # checked by load_robot
-    set_points = np.zeros((robot.modules, 2))
+    set_points = np.zeros((robot.modules, len(robot.directions)))
     for chamber in robot.chambers:
         share = duty[chamber.channel] if chamber.channel < len(duty) else 0.0
-        set_points[chamber.module - 1, "+-".index(chamber.side)] = share * robot.valve.full_scale_bar
+        set_points[chamber.module - 1, robot.actuator_of(chamber)] = share * robot.valve.full_scale_bar
     return set_points
 
 
@@ -104,8 +104,8 @@ def tool_poses(positions: Array, directors: Array) -> Array:
 def load_robot(file_or_name: str | Path) -> Robot:
     """The robot file of a robot that the rig can run; `RobotFileError` for one without valves."""
     robot = robot_file.load(file_or_name)
-    if robot.kind != "pneumatic":
-        raise RobotFileError(f"{file_or_name}: a {robot.kind} robot has no valves; the rig runs pneumatic robots")
+    if robot.valve is None:
+        raise RobotFileError(f"{file_or_name}: no [valve] in it, expected one; the rig runs robots with chambers")
     return robot
 
 
@@ -127,7 +127,7 @@ class ValvesAndArm:
     def channel_bar(self) -> dict[int, float]:
         """Chamber pressure at each valve channel in use, bar."""
         pressures = self.arm.pressures
-        return {c.channel: float(pressures[c.module - 1, "+-".index(c.side)]) for c in self.robot.chambers}
+        return {c.channel: float(pressures[c.module - 1, self.robot.actuator_of(c)]) for c in self.robot.chambers}
 
     def state(self) -> dict[str, Any]:
         """Plain values: time_s simulated, configuration (N, 3), pressure_bar (N, 2), channel_bar {channel: bar},
@@ -204,7 +204,7 @@ def cli(file_or_name: Path, pull_downs: bool) -> None:
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
 
-    arm = Arm(robot.kind, robot.modules)
+    arm = Arm(robot.preset, robot.modules)
     warm = ValvesAndArm(robot, arm)
     warm.advance(np.zeros(0), SLICE_S)  # compiles
     arm.reset()

@@ -157,13 +157,16 @@ def _tracking_table(values: dict[str, Any]) -> list[str]:
 # ---- Plot ---------------------------------------------------------------------------------------------------------
 
 
+CHAMBER_COLOURS = ("#2ca02c", "#9467bd", "#ff7f0e", "#8c564b")
+
+
 def picture(record: Record) -> Figure:
     """Angles above, pressures below, one column for each module."""
     modules, start = record.robot.modules, record.mono_ns[0]
     at_tick, at_slice = (record.mono_ns - start) * 1e-9, (record.plant_mono_ns - start) * 1e-9
     figure = plotting.figure(5.2 * modules, 7.0)
     panels = figure.subplots(2, modules, sharex=True, squeeze=False)
-    channels = {f"{c.module}{c.side}": c.channel for c in record.robot.chambers}
+    channels = {(c.module, c.direction_deg): c.channel for c in record.robot.chambers}
     for module in range(modules):
         above, below = panels[:, module]
         true = bending_angle_deg(record.plant_configuration[:, module])
@@ -175,12 +178,15 @@ def picture(record: Record) -> Figure:
         error = np.nanmean(tracking_error_deg(record)[:, module])
         above.set_title(f"module {module + 1}: mean error {error:.2f}°")
         above.grid(alpha=0.3)
-        for side, colour in (("+", "#2ca02c"), ("-", "#9467bd")):
-            commanded = record.commanded_bar[:, channels[f"{module + 1}{side}"]]
-            inside = record.plant_bar[:, module, "+-".index(side)]
+        for index, angle in enumerate(record.robot.actuators.directions_deg):
+            colour = CHAMBER_COLOURS[index % len(CHAMBER_COLOURS)]
+            commanded = record.commanded_bar[:, channels[module + 1, angle]]
+            inside = record.plant_bar[:, module, index]
             # Measured and commanded pressures differ little: a broad light line below a thin one.
-            below.plot(at_slice, inside, color=colour, lw=5.0, alpha=0.3, label=f"chamber {side}, measured")
-            below.step(at_tick, commanded, where="post", color=colour, lw=1.1, label=f"chamber {side}, commanded")
+            below.plot(at_slice, inside, color=colour, lw=5.0, alpha=0.3, label=f"chamber at {angle:g}°, measured")
+            below.step(
+                at_tick, commanded, where="post", color=colour, lw=1.1, label=f"chamber at {angle:g}°, commanded"
+            )
         below.set_xlabel("time, s")
         below.grid(alpha=0.3)
         below.set_xlim(-1.0, at_tick[-1] + 2.0)

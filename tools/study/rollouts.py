@@ -96,7 +96,7 @@ def code_sha256() -> str:
 
 def desired_of(plan: Plan, name: str, modules: int) -> Array:
     """The desired configurations (K, N, 3) of a task, as many steps as the plan has."""
-    return task(name, "cable", modules)[: plan.steps]
+    return task(name, "spatial", modules)[: plan.steps]
 
 
 def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], add_progress: AddProgress) -> None:

@@ -25,7 +25,7 @@ from modsoft.training import checkpoint as checkpoints
 from modsoft.training import fit, train
 from modsoft.training.data import dataset
 from modsoft.training.data.collect import collect
-from modsoft.training.settings import BY_KIND, Settings, fastest_precision
+from modsoft.training.settings import BY_DRIVE, Settings, fastest_precision
 from modsoft.training.simulation import simulators
 
 # Estimates for the remaining time: windows trained (batch 128) and samples simulated in a second of one core.
@@ -73,7 +73,7 @@ def settings_of(plan: Plan, model: Model) -> Settings:
     of_plan = plan.settings.get((model.network, model.data), {})
     of_model = {"network": model.network, "split": model.split, "seed": model.seed}
     precision = {"precision": fastest_precision()}
-    return Settings(**BY_KIND["cable"] | of_model | precision | of_plan)
+    return Settings(**BY_DRIVE["cables"] | of_model | precision | of_plan)
 
 
 def _train(plan: Plan, folder: Folder, model: Model, add_progress: AddProgress) -> None:

@@ -83,7 +83,7 @@ def compare(paths: list[Path]) -> list[Coverage]:
     """The coverage of each data set, at the number of samples of the smallest; `ModelError` for robots of different
     kinds or numbers of modules."""
     sets = [dataset.read(path) for path in paths]
-    robots = {(data.robot.kind, data.robot.modules) for data in sets}
+    robots = {(data.robot.preset, data.robot.modules) for data in sets}
     if len(robots) > 1:
         different = ", ".join(sorted(f"{kind} with {modules} modules" for kind, modules in robots))
         raise ModelError(f"data sets of different robots ({different}); plot them one by one")
@@ -92,7 +92,7 @@ def compare(paths: list[Path]) -> list[Coverage]:
     samples = min(data.samples for data in sets)
     coverages = []
     for path, data in zip(paths, sets, strict=True):
-        planar = kind == "pneumatic"
+        planar = data.robot.motion == "planar"
         reached = data.configuration[:, 1:].reshape(-1, modules, 3)
         evenly = np.linspace(0, len(reached) - 1, samples).round().astype(np.int64)
         positions = module_ends(reached[evenly], length_m)

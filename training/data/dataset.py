@@ -192,8 +192,7 @@ def split(data: DataSet, history: int, how: str, seed: int) -> tuple[Windows, Wi
     single windows at random, as in the paper. Neighbouring windows share most of their content, so that information of
     the test part leaks into training.
     """
-    kind = data.robot.kind
-    states = state_of(data.configuration, kind)
+    states = state_of(data.configuration, data.robot.motion)
     features = np.stack([episode_features(s, a, history) for s, a in zip(states, data.action, strict=True)])
     features, targets = features.astype(np.float32), data.action.astype(np.float32)
     part = _shuffled_parts(data, seed) if how == "shuffled" else _block_parts(data, history)

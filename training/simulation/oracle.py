@@ -19,7 +19,7 @@ from scipy.sparse.linalg import spsolve
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.errors import ModsoftError
-from modsoft.runtime.robot import KINDS
+from modsoft.runtime.layout import MOTIONS, PRESETS
 from modsoft.training.simulation.fleet import Fleet, Snapshot
 from modsoft.training.simulation.rollout import configuration_errors_percent, rollout
 
@@ -57,7 +57,7 @@ def oracle_error(kind: str, modules: int, desired: Array, *, seed: int = 0) -> O
 
 def greedy(kind: str, modules: int, desired: Array, *, seed: int = 0) -> Array:
     """Actions (K, N, A), each the best for the end of its own period, without regard to later ones."""
-    lanes, size = Fleet(kind, modules, 1).lanes, modules * len(KINDS[kind].action)
+    lanes, size = Fleet(kind, modules, 1).lanes, modules * len(MOTIONS[PRESETS[kind][0]].action)
     # The robot, one for each finite difference, and random starts to fill the last block, which take no extra time.
     robots = Fleet(kind, modules, -(-(size + 3) // lanes) * lanes)
     random = np.random.default_rng(seed)

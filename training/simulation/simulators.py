@@ -57,13 +57,13 @@ def by_fleet(
     robot: Robot, actions: Array, variant: str | None = None, *, perturbation: Perturbation = NOMINAL
 ) -> Array:
     """Robots side by side in compiled code."""
-    fleet = Fleet(robot.kind, robot.modules, len(actions), variant=variant, perturbation=perturbation)
+    fleet = Fleet(robot.preset, robot.modules, len(actions), variant=variant, perturbation=perturbation)
     return _run(fleet, actions, robot.loop.period_s)
 
 
 def by_elastica(robot: Robot, actions: Array, *, perturbation: Perturbation = NOMINAL) -> Array:
     """One robot after the other in PyElastica, the reference."""
-    arms = Arms(robot.kind, robot.modules, len(actions), perturbation=perturbation)
+    arms = Arms(robot.preset, robot.modules, len(actions), perturbation=perturbation)
     return _run(arms, actions, robot.loop.period_s)
 
 
@@ -73,7 +73,7 @@ def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:
 
 def _check(robot: Robot) -> None:
     """Refuses a control period or pressures that the simulated robot does not support."""
-    parameters, period_s = PARAMETERS[robot.kind], robot.loop.period_s
+    parameters, period_s = PARAMETERS[robot.preset], robot.loop.period_s
     steps = period_s / parameters.time_step_s
     if abs(steps - round(steps)) > 1e-6 * steps:
         raise RobotFileError(
