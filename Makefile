@@ -52,7 +52,7 @@ check: $(INSTALLED)
 # unit tests. Fails below 100 % of lines and branches.
 SAFETY_PARTS := connection controller loop safety stop
 coverage: $(INSTALLED)
-	.venv/bin/python tools/coverage.py
+	.venv/bin/python tools/measure_coverage.py
 	.venv/bin/python -m coverage run -m pytest -q $(foreach part,$(SAFETY_PARTS),$(wildcard tests/runtime/test_$(part)*.py))
 	.venv/bin/python -m coverage report
 

@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import clang_format
@@ -83,6 +84,13 @@ def test_python_files_and_functions_are_short_or_give_a_reason():
 def test_generated_file_is_up_to_date(generator):
     """firmware/protocol.h follows runtime/board/protocol.py, docs/wiring.svg follows firmware/pins.h."""
     subprocess.run([sys.executable, f"tools/{generator}.py", "--check"], cwd=ROOT, check=True)
+
+
+def test_no_script_has_the_name_of_an_installed_package():
+    """A script's own folder comes first on the path: `tools/coverage.py` was imported in place of the package."""
+    names = sys.stdlib_module_names | set(packages_distributions())
+    scripts = [path for folder in ("tools", "tools/bench", "examples") for path in (ROOT / folder).glob("*.py")]
+    assert [path for path in scripts if path.stem in names] == []
 
 
 def test_init_files_stay_empty():

@@ -51,11 +51,13 @@ def sources(*modules: str) -> dict[str, Path]:
 
 
 def _file(name: str) -> Path | None:
-    """A module's source file; None for what is no module, for instance a class that is imported from one."""
-    try:
-        spec = importlib.util.find_spec(name)
-    except ModuleNotFoundError:  # the name before the last dot is no package
+    """A module's source file; None for what is no module, for instance a class that is imported from one. Imports the
+    packages above it, which are empty, and no module."""
+    parent = name.rpartition(".")[0]
+    package = importlib.util.find_spec(parent) if parent else None
+    if parent and (package is None or package.submodule_search_locations is None):
         return None
+    spec = importlib.util.find_spec(name)
     return Path(spec.origin) if spec and spec.origin and spec.origin.endswith(".py") else None
 
 
