@@ -69,7 +69,7 @@
 #define SENSOR_MOST SENSOR_PRESSURE(SENSOR_MOST_MV)
 
 /* Pressure of a converter reading of 10 bits, in 1/4096 of 10 Pa: SENSOR_SLOPE * reading + SENSOR_OFFSET. */
-#define SENSOR_SLOPE ((int32_t)((5000 * 4LL * SENSOR_FULL + SENSOR_SPAN_MV / 2) / SENSOR_SPAN_MV))
+#define SENSOR_SLOPE ((int32_t)(5000 * 4LL * SENSOR_FULL / SENSOR_SPAN_MV))
 #define SENSOR_OFFSET ((int32_t)(-4096LL * SENSOR_ZERO_MV * SENSOR_FULL / SENSOR_SPAN_MV))
 
 /* After a lost link a ramp from P_MAX must end 670 ms after the last frame; the loop takes up to 40 ms of that. */

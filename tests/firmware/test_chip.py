@@ -184,7 +184,7 @@ def test_pressures(chip):
 
 @pytest.fixture
 def sensor45(native, tmp_path):
-    """Channels 0, 8 and 11 with sensors of 0.5 V at 0 and 4.5 V at 2 bar."""
+    """Channels 0, 7, 8 and 11 with sensors of 0.5 V at 0 and 4.5 V at 2 bar."""
     if not (native / "libsensor45.so").exists():
         pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
     return Chip(shutil.copy(native / "libsensor45.so", tmp_path))
@@ -205,33 +205,33 @@ def test_pressure_of_a_sensor_with_an_offset(sensor45, millivolt, units):
 
 
 def test_pressures_beyond_the_protocol_are_limited(native, tmp_path):
-    """0.5 to 1.5 V for 10 bar: the largest pressure of the protocol is 3.2767 bar."""
-    if not (native / "libsensor15.so").exists():
+    """Readings of 32768.1 and -32768.1 units; -32768 is NOT_MEASURED."""
+    if not (native / "libsensor9bar.so").exists():
         pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
-    chip = Chip(shutil.copy(native / "libsensor15.so", tmp_path))
+    chip = Chip(shutil.copy(native / "libsensor9bar.so", tmp_path))
     sensors = begin(chip)
     for _ in range(2):
         convert(chip, sensors, 225)
-    for reading in (1023, 0, 169, 168, 42, 43):
+    for reading in (1023, 0, 200, 56, 199, 57):
         convert(chip, sensors, reading)
-    exact = [(reading * 5000 / 1024 - 500) * 100000 / 1000 for reading in (169, 168, 42, 43)]
-    assert list(sensors.measured)[:2] == [32767, -32767]
-    assert list(sensors.measured)[2:6] == pytest.approx(exact, abs=0.6)
+    exact = [(reading * 5000 / 1024 - 625) * 93207 / 1000 for reading in (199, 57)]
+    assert list(sensors.measured)[:4] == [32767, -32767, 32767, -32767]
+    assert list(sensors.measured)[4:6] == pytest.approx(exact, abs=0.6)
 
 
 def test_inputs_8_to_11_are_selected_by_the_sixth_bit(sensor45):
     sensors = begin(sensor45)
-    assert (sensor45.registers[DIDR0], sensor45.registers[DIDR2]) == (0x01, 0x09)
+    assert (sensor45.registers[DIDR0], sensor45.registers[DIDR2]) == (0x81, 0x09)
     for _ in range(2):
         assert sensor45.registers[ADCSRB] == 0
         convert(sensor45, sensors, 225)
     selected = []
-    for _ in range(2 * (8 * 3 + 2)):
+    for _ in range(2 * (8 * 4 + 2)):
         high = sensor45.registers[ADCSRB]
         selected.append((high, convert(sensor45, sensors, 512)))
-    rounds = [(0, 0b01_0_00000), (MUX5, 0b01_0_00000), (MUX5, 0b01_0_00011)]
+    rounds = [(0, 0b01_0_00000), (0, 0b01_0_00111), (MUX5, 0b01_0_00000), (MUX5, 0b01_0_00011)]
     assert selected == (rounds * 8 + [(0, REFERENCE)] * 2) * 2
-    assert [channel for channel in range(12) if sensors.measured[channel] != NOT_MEASURED] == [0, 8, 11]
+    assert [channel for channel in range(12) if sensors.measured[channel] != NOT_MEASURED] == [0, 7, 8, 11]
 
 
 def test_without_sensors_only_the_supply_is_measured(native, tmp_path):
