@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from modsoft.hil.byte_damage import KINDS, ByteDamage
@@ -195,6 +195,8 @@ def test_status_rms_error_and_roll_of_a_tool():
     assert quaternions == ["+10000+00000+00000+00000", *["+07071+00000+00000+07071"] * 2]
 
 
+@example([0.0, 0.0, 1.0, 0.0])
+@example([5e-324, 0.5, 0.5, 0.0])
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3))
 def test_without_roll_keeps_the_direction_of_the_tool(values):
     q = tuple(np.array(values) / np.linalg.norm(values))

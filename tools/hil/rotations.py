@@ -53,6 +53,8 @@ def seen_from(rotation: Pose, pose: Pose) -> Pose:
 def without_roll(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
     """What a sensor of five degrees of freedom reports: the quaternion without its rotation about the tool's z axis."""
     w, x, y, z = q
-    size = math.hypot(w, z) or 1.0
+    size = math.hypot(w, z)
+    if size < 1e-12:  # z turned over: every roll gives such a quaternion, and this one has none
+        return 0.0, x, y, 0.0
     w, x, y = size, (x * w - y * z) / size, (y * w + x * z) / size
     return w, x, y, 0.0
