@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from floating_pins import command_down_after_ms
 from output_rises import rises
 
-from modsoft.hil.outputs import command_down_after_ms, emulated_us, read_outputs
+from modsoft.hil.outputs import emulated_us, read_outputs
 
 TOP = 4095
 READY = {"event": "ready", "channels": 3, "t_us": 0.0, "mono_ns": 0}

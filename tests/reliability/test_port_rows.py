@@ -118,13 +118,6 @@ def mega(serial_number, device):
     return SimpleNamespace(device=device, description="Arduino", vid=0x2341, pid=0x0042, serial_number=serial_number)
 
 
-def await_status(board, state, limit_s=5.0):
-    until_s = time.monotonic() + limit_s
-    while board.status is None or board.status.state != state:
-        assert time.monotonic() < until_s, board.status
-        time.sleep(0.005)
-
-
 def test_row_09_no_byte_to_the_bootloader(matrix_row):
     opens = 20
 

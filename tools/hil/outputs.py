@@ -9,13 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modsoft.hil.plant import FilteredPins
 from modsoft.runtime.arrays import Array
 
 Event = dict[str, Any]
 
-STEP_US = 1000.0
-DOWN_DUTY = 0.05 / 3.0  # P_DOWN of 3 bar valves
 FULL_COUNTS = 4096  # of the firmware's timers, where no output ever opened
 
 
@@ -43,23 +40,6 @@ class ValveOutputs(NamedTuple):
             return 0.0
         closed_row = open_rows[-1] + 1
         return max(0.0, float(self.t_us[closed_row] - since_us) * 1e-3) if closed_row < len(self.duty) else math.inf
-
-
-def command_down_after_ms(outputs: ValveOutputs, since_us: float, until_us: float, pull_downs: bool) -> float:
-    """Emulated milliseconds from `since_us` until the command of every valve stays below `DOWN_DUTY` up to `until_us`;
-    infinite where one does not. The command of a floating pin is the voltage of its filter (`FilteredPins`)."""
-    filters = FilteredPins(pull_downs)
-    driven = np.where(outputs.floating, np.nan, outputs.duty)
-    row = 0
-    now_us, last_up_us = float(min([since_us, *outputs.t_us[:1]])), -math.inf
-    while len(driven) and now_us < until_us:
-        while row + 1 < len(driven) and outputs.t_us[row + 1] <= now_us:
-            row += 1
-        command = filters.advance(driven[row], STEP_US * 1e-6)
-        now_us += STEP_US
-        if now_us > since_us and np.any(command >= DOWN_DUTY):
-            last_up_us = now_us
-    return math.inf if last_up_us >= until_us else max(0.0, (last_up_us - since_us) * 1e-3)
 
 
 def read_outputs(events: Sequence[Event]) -> ValveOutputs:
