@@ -64,6 +64,7 @@ def test_wheel_has_exactly_the_five_parts(wheel):
     assert tops == {"modsoft/runtime", "modsoft/training", "modsoft/export", "modsoft/hil", "modsoft/study"}
     for robot in ("cable-4", "cable-6", "pneumatic-2", "pneumatic-3"):
         assert f"modsoft/runtime/robots/{robot}.toml" in names
+    assert "modsoft/runtime/calibration/file.py" in names
     # the emulated board links a GPL library: a test tool of the checkout, never distributed
     assert not [name for name in names if name.endswith("board.c")]
 
@@ -94,6 +95,7 @@ def test_runtime_without_extras_works_without_the_heavy_packages(clean):
     subprocess.run([runtime, "--check", "robot.toml"], cwd=clean, check=True)
     helped = subprocess.run([runtime, "--help"], capture_output=True, text=True, check=True)
     assert "--port" in helped.stdout
+    subprocess.run([clean / "venv/bin/modsoft-calibrate", "--help"], stdout=subprocess.DEVNULL, check=True)
 
 
 def write_robot_at_rest(path, seconds=6.0, hz=20.0):

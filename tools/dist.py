@@ -58,6 +58,7 @@ def check(archive: Path, has_compiler: bool) -> None:
         expect("0." in run("modsoft-runtime", "--version"), "the version")
         (folder / "robot.toml").write_text(run("modsoft-runtime", "--print-robot", "pneumatic-3"), encoding="utf-8")
         run("modsoft-runtime", "--check", "robot.toml")
+        expect("robot.calibration.toml" in run("modsoft-calibrate", "--help"), "the help of modsoft-calibrate")
         write_recording(folder / "recording.jsonl")
         run(
             "modsoft-runtime",
