@@ -80,7 +80,7 @@ class TickRecord(msgspec.Struct, eq=False, tag_field="event", tag="tick"):
     frame_detail: str  # the values behind frame_status, such as the tool that was hidden; empty for a good frame
     frame: FrameRecord | None  # the newest frame; None before the first
     configuration: Array | None  # (N, 3) measured [v_x, v_y, v_z] at the start of the step; None without a good frame
-    desired: Array  # (N, 3) desired configuration at the start of the step
+    desired: Array  # (N, 3) desired configuration at the start of the step; NaN: none, the actuations are given
     board: BoardRecord | None  # before this step's set-points; None before the first status and in a dry run
     acknowledged: Acknowledgement  # of the set-points before this step's
     connection: dict[str, int]  # counts of the board's connection since the port was opened, before the set-points

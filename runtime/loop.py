@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Protocol
 
@@ -11,8 +11,7 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS, State, Status
 from modsoft.runtime.clock import SLICE_S, Tick, Ticker
 from modsoft.runtime.control.actuation import channel_pressures_bar
-from modsoft.runtime.control.controller import Controller, Policy
-from modsoft.runtime.control.correction import Correction, NoCorrection
+from modsoft.runtime.control.controller import Control
 from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.errors import LostInRun
 from modsoft.runtime.log_record import (
@@ -54,11 +53,15 @@ class Valves(Protocol):
 
 @dataclass(frozen=True)
 class Loop:
-    """What a run consists of. `desired` (K, N, 3): configurations at the start of each step; in step k the model gets
-    row k + 1 as reference, and the error is that at the start of step k. `correction`: a new one for each run."""
+    """What a run consists of.
+
+    control: called with the configuration (N, 3) at rest; decides on the actuations. desired (K, N, 3): configurations
+    at the start of each step, NaN where there is none; in step k the control gets row k + 1 as reference, and the error
+    is that at the start of step k.
+    """
 
     robot: Robot
-    model: Policy
+    control: Callable[[Array], Control]
     desired: Array
     frames: LatestFrame
     validator: FrameValidator
@@ -67,7 +70,6 @@ class Loop:
     stop: Stop
     log: Callable[[Record], None]
     statistics: TickStatistics
-    correction: Correction = field(default_factory=NoCorrection)
     warm_up: WarmUp | None = None
 
     def run(self, rest: Array) -> None:
@@ -75,7 +77,7 @@ class Loop:
 
         Returns one period after the last step. Whatever ends the task earlier is raised; the caller vents.
         """
-        controller, faults = Controller(self.robot, self.model, rest, self.correction), FaultCounter(self.robot)
+        controller, faults = self.control(rest), FaultCounter(self.robot)
         references, step, sequence = next_reference(self.desired), -1, self._start(controller)
 
         def prepare(left_s: float) -> float:
@@ -95,7 +97,7 @@ class Loop:
             step = tick.index
             sequence = self._step(tick, references[step], controller, faults, acknowledged)
 
-    def _start(self, controller: Controller) -> int | None:
+    def _start(self, controller: Control) -> int | None:
         """Sends actuation 0 for one period before step 0, since the history of the model begins with it. Returns the
         sequence number of the set-points."""
         bar = channel_pressures_bar(self.robot, controller.applied, CHANNELS)
@@ -108,7 +110,7 @@ class Loop:
         return sequence
 
     def _step(
-        self, tick: Tick, reference: Array, controller: Controller, faults: FaultCounter, acknowledged: Acknowledgement
+        self, tick: Tick, reference: Array, controller: Control, faults: FaultCounter, acknowledged: Acknowledgement
     ) -> int | None:
         """One control step. Returns the sequence number of its set-points, None where it sent none: the acknowledgement
         of the step before is then not taken for that of this one."""
@@ -167,7 +169,7 @@ class Loop:
         tick: Tick,
         frame: TrackerFrame | None,
         check: FrameCheck,
-        controller: Controller,
+        controller: Control,
         acknowledged: Acknowledgement,
     ) -> TickRecord:
         """The record of a step that begins: what is known before its set-points."""

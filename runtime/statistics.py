@@ -23,7 +23,7 @@ class TickStatistics:
         self.status = ""
         self.late_ms: list[float] = []
         self.acknowledged_ms: list[float | None] = []
-        self.error_deg: list[Array] = []  # (N,) of every step with a good frame
+        self.error_deg: list[Array] = []  # (N,) of every step with a good frame and a desired configuration
         self.bad: Counter[str] = Counter()  # steps held, by the reason
         self.missed = 0  # steps skipped, or begun too late to send
         self._channels = sorted(chamber.channel for chamber in robot.chambers)
@@ -39,7 +39,7 @@ class TickStatistics:
         self.missed += record.missed + (not record.sent)
         if record.configuration is None:
             self.bad[record.frame_status] += 1
-        else:
+        elif not np.isnan(record.desired).any():
             self.error_deg.append(bending_error_deg(record.configuration, record.desired))
         self.status = self._status_line(record)
         self._before_ns = record.mono_ns

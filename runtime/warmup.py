@@ -13,7 +13,7 @@ from collections.abc import Callable
 from modsoft.runtime.board.protocol import CHANNELS
 from modsoft.runtime.clock import SPIN_S
 from modsoft.runtime.control.actuation import channel_pressures_bar
-from modsoft.runtime.control.controller import Controller
+from modsoft.runtime.control.controller import Control
 from modsoft.runtime.log_record import Record, WarmUpFailedRecord
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameValidator
@@ -50,7 +50,7 @@ class WarmUp:
         self._fastest_step_s = min(self._fastest_step_s, seconds)
         self._runs = 0
 
-    def before(self, left_s: float, frame: TrackerFrame | None, controller: Controller) -> float:
+    def before(self, left_s: float, frame: TrackerFrame | None, controller: Control) -> float:
         """Runs if it is time, with the newest frame. Returns how many of the `left_s` seconds until the step is due to
         wait before the next call: 0 after a run."""
         lead_s = LEAD * self._fastest_step_s
@@ -74,7 +74,7 @@ class WarmUp:
         self._runs += 1
         return 0.0
 
-    def _run(self, frame: TrackerFrame, controller: Controller) -> None:
+    def _run(self, frame: TrackerFrame, controller: Control) -> None:
         configuration = self._validator.content(frame)[2]
         if configuration is not None:
             channel_pressures_bar(self._robot, controller.preview(configuration), CHANNELS)

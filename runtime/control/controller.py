@@ -26,6 +26,19 @@ class Policy(Protocol):
     def actuate(self) -> Callable[[Array], Array]: ...
 
 
+class Control(Protocol):
+    """Decides on the actuations of one run of the loop: `Controller`, or `Sequence`."""
+
+    applied: Array  # (N, A), in force
+    target: Array | None  # see `Controller`
+    raw: Array | None
+
+    def compute(self, measured: Array | None, desired: Array, next_desired: Array) -> Array: ...
+    def preview(self, target: Array) -> Array: ...
+    def record(self, actuation: Array) -> None: ...
+    def skip(self) -> None: ...
+
+
 class Controller:
     """The controller of one run: feature window, last measured state, applied actuation. In each control step call
     `compute`, then `record`."""
@@ -81,3 +94,34 @@ class Controller:
         check_actuation(raw)
         largest_step = self._robot.limits.largest_actuation_step
         return limited(raw, self.applied, largest_step, module_actuators(self._robot.directions))
+
+
+class Sequence:
+    """Actuations that are known before the run, one for each step, as for the collection of data. A step without a
+    valid frame holds the applied actuation; the sequence goes on meanwhile."""
+
+    target: Array | None = None
+    raw: Array | None = None
+
+    def __init__(self, robot: Robot, actuations: Array):
+        """actuations (K, N, A). They are limited as those of a controller."""
+        self._robot, self._actuations, self._step = robot, actuations, 0
+        self.applied = np.zeros((robot.modules, robot.action_size))
+
+    def compute(self, measured: Array | None, desired: Array, next_desired: Array) -> Array:
+        """The actuation (N, A) of this step; see `Controller.compute`. The desired configurations have no effect."""
+        if measured is None:
+            return self.applied
+        largest_step, actuators = self._robot.limits.largest_actuation_step, module_actuators(self._robot.directions)
+        return limited(self._actuations[self._step], self.applied, largest_step, actuators)
+
+    def preview(self, target: Array) -> Array:
+        """The applied actuation: there is no computation to prepare."""
+        return self.applied
+
+    def record(self, actuation: Array) -> None:
+        self.applied = actuation
+        self._step += 1
+
+    def skip(self) -> None:
+        self._step += 1

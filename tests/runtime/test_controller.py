@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from modsoft.runtime import robot as robot_file
-from modsoft.runtime.control.controller import Controller
+from modsoft.runtime.control.controller import Controller, Sequence
 from modsoft.runtime.control.correction import NoCorrection
 from modsoft.runtime.control.features import Window, from_angles_deg, state_of
 from modsoft.runtime.errors import ModelError
@@ -111,3 +111,23 @@ def test_preview_computes_the_step_and_changes_nothing():
     policy.output = np.full((3, 1), np.nan)
     with pytest.raises(ModelError):
         controller.preview(NEXT)
+
+
+def test_sequence_is_applied_within_the_limits():
+    sequence = Sequence(ROBOT, np.array([[[0.3]] * 3, [[1.3]] * 3, [[-2.0]] * 3]))
+    actuations = []
+    for _ in range(3):
+        actuations.append(sequence.compute(REST, NEXT, NEXT)[0, 0])
+        sequence.record(np.full((3, 1), actuations[-1]))
+    assert actuations == pytest.approx([0.3, 1.0, 0.2])
+
+
+def test_sequence_holds_without_a_frame_and_goes_on_meanwhile():
+    sequence = Sequence(ROBOT, np.array([[[0.1]] * 3, [[0.2]] * 3, [[0.3]] * 3, [[0.4]] * 3]))
+    sequence.record(sequence.compute(REST, NEXT, NEXT))
+    held = sequence.compute(None, NEXT, NEXT)
+    assert held[0, 0] == 0.1
+    sequence.record(held)
+    sequence.skip()
+    assert sequence.applied[0, 0] == 0.1
+    assert sequence.compute(REST, NEXT, NEXT)[0, 0] == 0.4

@@ -1,5 +1,7 @@
 """The loop on virtual time."""
 
+import dataclasses
+
 import msgspec
 import numpy as np
 import pytest
@@ -21,7 +23,6 @@ from modsoft.runtime.control.features import (
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
 from modsoft.runtime.log_reader import Run
 from modsoft.runtime.log_record import DoneRecord, StartRecord, TickRecord, encode
-from modsoft.runtime.loop import Loop
 from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.stop import Interrupted, StopKey
 
@@ -341,19 +342,7 @@ def test_two_modules_run_with_the_same_loop():
 
 def test_a_rehearsal_runs_the_task_without_a_board():
     world = World(steps=5)
-    loop = world.loop
-    Loop(
-        loop.robot,
-        loop.model,
-        loop.desired,
-        loop.frames,
-        loop.validator,
-        DryRunBoard(),
-        loop.ticker,
-        loop.stop,
-        loop.log,
-        loop.statistics,
-    ).run(REST)
+    dataclasses.replace(world.loop, valves=DryRunBoard()).run(REST)
     assert world.sent == []
     assert len(world.ticks) == 5
     assert world.ticks[0].board is None

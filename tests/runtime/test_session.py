@@ -4,14 +4,14 @@ import json
 
 import pytest
 
+from modsoft.runtime import devices, shutdown
 from modsoft.runtime import robot as robot_file
-from modsoft.runtime import session, shutdown
 from modsoft.runtime.board.protocol import VentMode
-from modsoft.runtime.errors import LostInRun, ModelError, Tripped, UsageError
+from modsoft.runtime.errors import DeviceAbsent, LostInRun, ModelError, Tripped, UsageError
 from modsoft.runtime.log import RunLog
 from modsoft.runtime.safety import FrameValidator
 from modsoft.runtime.statistics import TickStatistics
-from modsoft.runtime.stop import Interrupted, Stop, StopKey
+from modsoft.runtime.stop import Interrupted, StopKey
 from modsoft.runtime.tracking.frame import LatestFrame
 
 ROBOT = robot_file.load("pneumatic-3")
@@ -130,19 +130,19 @@ def test_arming_needs_somebody(monkeypatch):
 
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     with pytest.raises(UsageError, match="--yes"):
-        session._confirm()
+        devices.confirm()
     monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
-    session._confirm()
+    devices.confirm()
 
 
-def test_no_frame_is_waited_for_only_so_long(monkeypatch):
+def test_no_frame_is_waited_for_only_so_long():
     clock = [0.0]
-    stop = Stop()
-    monkeypatch.setattr(stop, "wait", lambda seconds: clock.__setitem__(0, clock[0] + seconds))
-    with pytest.raises(session.DeviceAbsent, match="no good frame within 5 s, the last one no frame"):
-        session._rest(LatestFrame(), FrameValidator(ROBOT), stop, lambda: clock[0])
+    rig = devices.Devices(
+        ROBOT, LatestFrame(), None, lambda: clock[0], lambda seconds: clock.__setitem__(0, clock[0] + seconds)
+    )
+    with pytest.raises(DeviceAbsent, match="no good frame within 5 s, the last one no frame"):
+        rig.rest(FrameValidator(ROBOT))
     assert clock[0] == pytest.approx(5.0, abs=0.02)
-    slot = LatestFrame()
-    slot.error = OSError("unplugged")
-    with pytest.raises(session.DeviceAbsent, match="unplugged"):
-        session._rest(slot, FrameValidator(ROBOT), stop, lambda: clock[0])
+    rig.frames.error = OSError("unplugged")
+    with pytest.raises(DeviceAbsent, match="unplugged"):
+        rig.rest(FrameValidator(ROBOT))

@@ -9,18 +9,16 @@ import math
 
 import numpy as np
 from stepped_port import SteppedPort
-from virtual_loop import PERIOD_S, ROBOT, planar_poses
+from virtual_loop import ROBOT, planar_poses
 
-from modsoft.runtime import session, shutdown
+from modsoft.runtime import shutdown
 from modsoft.runtime.board.board import Board
-from modsoft.runtime.clock import Ticker
+from modsoft.runtime.control.controller import Controller
 from modsoft.runtime.control.features import from_angles_deg
-from modsoft.runtime.errors import LostInRun
+from modsoft.runtime.devices import Devices
 from modsoft.runtime.log import RunLog
-from modsoft.runtime.loop import Loop
-from modsoft.runtime.safety import FrameValidator
 from modsoft.runtime.statistics import TickStatistics
-from modsoft.runtime.stop import Signals, Stop
+from modsoft.runtime.stop import Signals
 from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 
 STEPS = 40
@@ -39,8 +37,9 @@ class SteppedRun:
         self.clock = self.port.clock
         self.board = Board(self.port, "the emulated MEGA", self.clock, threaded=False)
         self._pump, self.board._io_thread.pump = self.board._io_thread.pump, self.pump
-        self.frames, self.stop, self.statistics = LatestFrame(), Stop(), TickStatistics(ROBOT, STEPS)
-        self.stop.wait = self.wait
+        self.frames, self.statistics = LatestFrame(), TickStatistics(ROBOT, STEPS)
+        self.devices = Devices(ROBOT, self.frames, self.board, self.clock, self.wait)
+        self.stop = self.devices.stop
         self.log = RunLog(folder, ROBOT.name, "", {})
         self.cause_s += self.clock()
 
@@ -72,31 +71,10 @@ class SteppedRun:
         """Arms, runs, vents and closes."""
         desired = from_angles_deg(np.zeros((STEPS, ROBOT.modules)))
         say, shutdown.say = shutdown.say, self.say
-        error = None
         try:
-            with Signals(self.stop, self.forced_exits.append) as signals:
+            with Signals(self.stop, self.forced_exits.append) as signals, contextlib.closing(self.board):
                 signals.hold()
-                try:
-                    self.board.arm(ROBOT)
-                    validator = FrameValidator(ROBOT)
-                    rest = session._rest(self.frames, validator, self.stop, self.clock, LostInRun)
-                    ticker = Ticker(PERIOD_S, self.clock, self.wait)
-                    Loop(
-                        ROBOT,
-                        self,
-                        desired,
-                        self.frames,
-                        validator,
-                        self.board,
-                        ticker,
-                        self.stop,
-                        self.log.put,
-                        self.statistics,
-                    ).run(rest)
-                except BaseException as raised:  # noqa: BLE001 - as in the session itself
-                    error = raised
-                with contextlib.closing(self.board):
-                    shutdown.finish(self.board, self.log, self.statistics, self.frames, error)
+                self.devices.drive(lambda rest: Controller(ROBOT, self, rest), desired, self.log, self.statistics)
         except BaseException as raised:  # noqa: BLE001 - checked by the test
             self.error = raised
         finally:

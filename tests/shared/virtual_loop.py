@@ -13,6 +13,7 @@ import numpy as np
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.protocol import CHANNELS, State
 from modsoft.runtime.clock import Ticker
+from modsoft.runtime.control.controller import Controller
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.log_record import Record, TickRecord
 from modsoft.runtime.loop import Loop
@@ -94,7 +95,7 @@ class World:
         self.tick_statistics = TickStatistics(robot, steps)
         self.loop = Loop(
             robot,
-            self,
+            lambda rest: Controller(robot, self, rest),
             desired,
             self.frames,
             FrameValidator(robot),

@@ -33,6 +33,7 @@ from modsoft.runtime.board.codec import encode
 from modsoft.runtime.board.ports import open_port
 from modsoft.runtime.board.protocol import CHANNELS, Set
 from modsoft.runtime.clock import Ticker, spinning
+from modsoft.runtime.control.controller import Controller
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.log_record import Record, TickRecord
@@ -188,7 +189,7 @@ def _run_loop(
     validator = FrameValidator(robot)
     Loop(
         robot,
-        Stamped(model, "actuate", stamps, "features", "actuation"),
+        lambda rest: Controller(robot, Stamped(model, "actuate", stamps, "features", "actuation"), rest),
         np.repeat(from_angles_deg(np.zeros((1, robot.modules))), count, axis=0),
         latest,
         Stamped(validator, "check", stamps, "taken", "validated"),
