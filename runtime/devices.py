@@ -144,12 +144,13 @@ class Devices:
         statistics: TickStatistics,
         warm_up: bool = False,
         status: Callable[[], str] = lambda: "",
+        set_points_bar: Callable[[Array], Array] | None = None,
     ) -> None:
         """One run: arms the board, runs the loop for the steps of `desired` (see `Loop`), vents, closes the log.
 
-        control: called with the configuration (N, 3) at rest. status: text at the beginning of the status line. Returns
-        after the last step, when the board has confirmed the venting (or after a dry run); raises what ended it
-        earlier.
+        control: called with the configuration (N, 3) at rest. status: text at the beginning of the status line.
+        set_points_bar: see `Loop`. Returns after the last step, when the board has confirmed the venting (or after a
+        dry run); raises what ended it earlier.
         """
         error: BaseException | None = None
         self._keys = Keys(self.stop)
@@ -157,7 +158,7 @@ class Devices:
             try:
                 exits.enter_context(self._keys)
                 with StatusLine(lambda: status() + _status(statistics, log), sys.stderr):
-                    self._control(control, desired, log, statistics, warm_up)
+                    self._control(control, desired, log, statistics, warm_up, set_points_bar)
             except BaseException as raised:  # noqa: BLE001 - raised again after the venting
                 error = raised
             finish(self.board, log, statistics, self.frames, error)
@@ -169,6 +170,7 @@ class Devices:
         log: RunLog,
         statistics: TickStatistics,
         warm_up: bool,
+        set_points_bar: Callable[[Array], Array] | None,
     ) -> None:
         """Arms the board and runs the loop; venting is the caller's."""
         robot, board = self.robot, self.board
@@ -188,6 +190,7 @@ class Devices:
             log.put,
             statistics,
             WarmUp(robot, validator, log.put) if warm_up else None,
+            set_points_bar,
         ).run(rest)
 
 

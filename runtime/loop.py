@@ -57,7 +57,8 @@ class Loop:
 
     control: called with the configuration (N, 3) at rest; decides on the actuations. desired (K, N, 3): configurations
     at the start of each step, NaN where there is none; in step k the control gets row k + 1 as reference, and the error
-    is that at the start of step k.
+    is that at the start of step k. set_points_bar: pressures (channels,) of an actuation; None: those of eq. (3) in the
+    robot's chambers.
     """
 
     robot: Robot
@@ -71,6 +72,7 @@ class Loop:
     log: Callable[[Record], None]
     statistics: TickStatistics
     warm_up: WarmUp | None = None
+    set_points_bar: Callable[[Array], Array] | None = None
 
     def run(self, rest: Array) -> None:
         """Runs the whole task from `rest` (N, 3), the configuration of the vented robot; the board is armed.
@@ -100,7 +102,7 @@ class Loop:
     def _start(self, controller: Control) -> int | None:
         """Sends actuation 0 for one period before step 0, since the history of the model begins with it. Returns the
         sequence number of the set-points."""
-        bar = channel_pressures_bar(self.robot, controller.applied, CHANNELS)
+        bar = self._pressures_bar(controller.applied)
         self._idle()  # arming takes a second: after a stop request during it, no valve may open
         before_ns = _ns(self.ticker.now())  # no valve may be open earlier
         sequence = self.valves.set_pressures(0, bar)
@@ -120,7 +122,7 @@ class Loop:
         try:
             faults.frame(check)
             actuation = controller.compute(check.configuration, record.desired, reference)
-            bar = channel_pressures_bar(self.robot, actuation, CHANNELS)
+            bar = self._pressures_bar(actuation)
             if self.ticker.too_late(tick.index):
                 self.valves.publish_tick(tick.index + 1)
                 faults.missed(1)
@@ -138,6 +140,11 @@ class Loop:
         if self.warm_up is not None:
             self.warm_up.step_took(step_s)
         return sequence
+
+    def _pressures_bar(self, actuation: Array) -> Array:
+        if self.set_points_bar is not None:
+            return self.set_points_bar(actuation)
+        return channel_pressures_bar(self.robot, actuation, CHANNELS)
 
     def _idle(self) -> None:
         """Between two steps: raises a stop request, and the loss of the board or the tracker."""

@@ -45,6 +45,15 @@ def test_a_whole_task():
     assert [type(record) for record in world.records if not isinstance(record, TickRecord)] == [StartRecord, DoneRecord]
 
 
+def test_pressures_of_a_calibration_replace_those_of_the_actuation():
+    world = World(steps=3)
+    rows = np.eye(CHANNELS)[:4] * 0.1
+    world.loop = dataclasses.replace(world.loop, set_points_bar=lambda actuation: rows[len(world.sent)])
+    world.run()
+    assert np.array_equal([pressures for _, _, pressures in world.sent], rows)
+    assert np.array_equal([record.commanded_bar for record in world.ticks], rows[1:])
+
+
 def test_every_line_can_be_written_and_says_what_the_task_wanted():
     world = World(steps=5).run()
     for step, record in enumerate(world.ticks):
