@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from modsoft.hil.plant import FilteredPins, ValvesAndArm, duties_from, run, set_points_bar, tool_poses
+from modsoft.hil.plant import FilteredPins, ValvesAndArm, duties_from, run, tool_poses
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.actuation import channel_pressures_bar, pressures_bar
 from modsoft.runtime.control.features import from_directors, from_poses
@@ -53,11 +53,15 @@ def robot():
 def test_set_points_invert_the_commands_of_the_runtime(robot):
     actuation = np.array([[0.3], [-1.0], [0.0]])
     duty = channel_pressures_bar(robot, actuation) / robot.valve.full_scale_bar
-    np.testing.assert_allclose(set_points_bar(robot, duty), pressures_bar(robot, actuation), atol=1e-12)
+    plant = ValvesAndArm(robot, RigidArm(3))
+    plant.advance(duty, 0.02)
+    np.testing.assert_allclose(plant.arm.pressures, pressures_bar(robot, actuation), atol=1e-12)
 
 
 def test_no_duty_is_no_pressure(robot):
-    assert not set_points_bar(robot, np.zeros(0)).any()
+    plant = ValvesAndArm(robot, RigidArm(3))
+    plant.advance(np.zeros(0), 0.02)
+    assert not plant.arm.pressures.any()
 
 
 def test_tracker_sees_the_configuration(robot):

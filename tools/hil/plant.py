@@ -8,8 +8,8 @@ each valve channel in [0, 1]; its end ends the process. Standard output, one JSO
                                                  time at which the state is due
     {"event": "summary", ...}                    slices, lateness
 
-The valves are ideal: a duty is that share of the full-scale pressure; null is a pin that floats (`FilteredPins`). Lag
-and chamber belong to `modsoft.training`.
+The valves are ideal: a duty is that share of the full-scale pressure (`Pneumatics`); null is a pin that floats
+(`FilteredPins`). Lag and chamber belong to `modsoft.training`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from typing import Any, Protocol
 import click
 import numpy as np
 
+from modsoft.hil.pneumatics import Pneumatics
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.entry_point import entry
@@ -56,16 +57,6 @@ class PneumaticArm(Protocol):
     def pressures(self) -> Array: ...  # (N, 2), bar, in the chambers
     def set_pressures(self, bar: Array) -> None: ...
     def advance(self, duration_s: float) -> None: ...
-
-
-def set_points_bar(robot: Robot, duty: Array) -> Array:
-    """Set-points of the chambers (N, n), bar, in the order of the actuators, from the valves' duties (channels,)."""
-    assert robot.valve is not None  # checked by load_robot
-    set_points = np.zeros((robot.modules, len(robot.directions)))
-    for chamber in robot.chambers:
-        share = duty[chamber.channel] if chamber.channel < len(duty) else 0.0
-        set_points[chamber.module - 1, robot.actuator_of(chamber)] = share * robot.valve.full_scale_bar
-    return set_points
 
 
 class FilteredPins:
@@ -110,24 +101,30 @@ def load_robot(file_or_name: str | Path) -> Robot:
 
 
 class ValvesAndArm:
-    """The arm behind its valves: duties in, poses and chamber pressures out."""
+    """The arm behind its valves: duties in, poses and readings of the pressure sensors out."""
 
-    def __init__(self, robot: Robot, arm: PneumaticArm, pull_downs: bool = True):
+    def __init__(self, robot: Robot, arm: PneumaticArm, pull_downs: bool = True, pneumatics: Pneumatics | None = None):
+        """pneumatics: valves, hoses and sensors; those of the robot file by default."""
         self.pins = FilteredPins(pull_downs)
         self.robot = robot
         self.arm = arm
+        self.pneumatics = pneumatics or Pneumatics.of(robot)
         self.time_s = 0.0
+        self._outlets_bar = self.pneumatics.outlets_bar(np.zeros(0))
 
     def advance(self, duty: Array, duration_s: float) -> None:
         """Advances the arm with the duties (channels,) held; NaN: the pin floats."""
-        self.arm.set_pressures(set_points_bar(self.robot, self.pins.advance(duty, duration_s)))
+        self._outlets_bar = self.pneumatics.outlets_bar(self.pins.advance(duty, duration_s))
+        shape = (self.robot.modules, len(self.robot.directions))
+        self.arm.set_pressures(self.pneumatics.set_points_bar(self._outlets_bar, shape))
         self.arm.advance(duration_s)
         self.time_s += duration_s
 
     def channel_bar(self) -> dict[int, float]:
-        """Chamber pressure at each valve channel in use, bar."""
-        pressures = self.arm.pressures
-        return {c.channel: float(pressures[c.module - 1, self.robot.actuator_of(c)]) for c in self.robot.chambers}
+        """Reading of the pressure sensor of each valve channel in use, bar: the chamber's pressure."""
+        chambers_bar = np.asarray(self.arm.pressures)
+        channels = sorted(self.pneumatics.hoses)
+        return {each: self.pneumatics.sensor_bar(each, self._outlets_bar, chambers_bar) for each in channels}
 
     def state(self) -> dict[str, Any]:
         """Plain values: time_s simulated, configuration (N, 3), pressure_bar (N, 2), channel_bar {channel: bar},
