@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 
 import pytest
-from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.stepped_port import SteppedPort
 from modsoft.runtime.board.board import Board
 
 

@@ -3,9 +3,9 @@
 import pytest
 from mega_in_run import stepped_host
 from output_rises import rises
-from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard
+from modsoft.hil.board.stepped_port import SteppedPort
 from modsoft.hil.board.toolchain import missing_packages
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board import connection

@@ -12,9 +12,9 @@ import pytest
 from mega_in_run import Host, in_stepped_run, inject, side_by_side, stepped_host
 from output_rises import rises
 from runtime_in_run import Run, Stand
-from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.stepped_port import SteppedPort
 from modsoft.hil.board.toolchain import missing_packages
 from modsoft.runtime.board import connection, ports
 from modsoft.runtime.board.board import Board

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 from floating_pins import PULLED_DOWN_MS, add_rows, down_ms
 from mega_in_run import Host, in_stepped_run, inject, stepped_host
-from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.stepped_port import SteppedPort
 from modsoft.hil.board.toolchain import FIRMWARE, FIRMWARE_ELF, build, missing_packages
 from modsoft.hil.outputs import read_outputs
 from modsoft.runtime import robot as robot_file

@@ -11,9 +11,9 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from stepped_port import SteppedPort
 
 from modsoft.hil.board.emulator import EmulatedBoard
+from modsoft.hil.board.stepped_port import SteppedPort
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.ports import open_port

@@ -8,9 +8,9 @@ import contextlib
 import math
 
 import numpy as np
-from stepped_port import SteppedPort
 from virtual_loop import ROBOT, planar_poses
 
+from modsoft.hil.board.stepped_port import SteppedPort
 from modsoft.runtime import shutdown
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.control.controller import Controller

@@ -83,7 +83,7 @@ class EmulatedBoard:
         port_link: where the link to the serial port goes; a temporary folder where it is None.
         fast: run as fast as it can. The board's time-outs then fire early for a host in real time: only emulated
         times (`t_us`) are meaningful.
-        stepped: its time advances only in `run`; tests/shared/stepped_port.py is a serial port for it.
+        stepped: its time advances only in `run`; `modsoft.hil.board.stepped_port` is a serial port for it.
         """
         self.board = choose(board)
         self._firmware = firmware

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import serial
 
@@ -20,11 +21,18 @@ class SteppedPort:
     be read after it.
     """
 
-    def __init__(self, board: EmulatedBoard, name: str = "", baud: int = 250_000) -> None:
-        """board: started with `stepped`. name: the port's new name, if the board was plugged in again."""
+    def __init__(
+        self,
+        board: EmulatedBoard,
+        name: str = "",
+        baud: int = 250_000,
+        on_step: Callable[[float], None] = lambda duration_s: None,
+    ) -> None:
+        """board: started with `stepped`. name: the port's new name, if the board was plugged in again. on_step: called
+        after every step, of 5 ms at most, with its duration in seconds."""
         self.dtr = True
         self.written: list[tuple[float, bytes]] = []  # (clock, bytes)
-        self._board = board
+        self._board, self._on_step = board, on_step
         self._port = serial.Serial(name or board.port, baud, timeout=0, exclusive=True)
         self._from_host, self._taken = board.last_run["from_host"], board.last_run["to_host"]
 
@@ -34,7 +42,10 @@ class SteppedPort:
 
     def idle(self, seconds: float) -> None:
         """Advances time without reading."""
-        self._step(round(seconds * 1e6))
+        left_us = round(seconds * 1e6)
+        while left_us > 0:
+            self._step(min(left_us, STEP_US))
+            left_us -= STEP_US
 
     @property
     def in_waiting(self) -> int:
@@ -67,3 +78,4 @@ class SteppedPort:
         until_s = time.monotonic() + ARRIVES_IN_S
         while self.in_waiting < in_transit and time.monotonic() < until_s:
             time.sleep(0)
+        self._on_step(microseconds * 1e-6)
