@@ -11,7 +11,7 @@ import torch
 
 from modsoft.export import foreign
 from modsoft.runtime import robot as robot_file
-from modsoft.runtime.control.features import feature_names
+from modsoft.runtime.control.features import check_planar_state, feature_names
 from modsoft.runtime.control.model_file import Network
 from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.runtime.files import read_text
@@ -117,6 +117,7 @@ def _check(checkpoint: dict[str, Any], path: Path) -> None:
     fixed = None if network.name == "bilstm" else robot.modules
     if network.modules != fixed:
         raise ModelError(f"{path}: {network.name} of {network.modules} modules, expected {fixed}; train it again")
+    check_planar_state([str(name) for name in checkpoint["features"]], motion, path)
     expected = feature_names(motion, history)
     if list(checkpoint["features"]) != expected:
         raise ModelError(f"{path}: features {list(checkpoint['features'])}, expected for {motion} motion {expected}")

@@ -27,7 +27,7 @@ class Components(NamedTuple):
 
 
 MOTIONS: dict[str, Components] = {
-    "planar": Components(("v_x", "v_y"), ("a_0",)),
+    "planar": Components(("v_x", "v_z"), ("a_0",)),
     "spatial": Components(("v_z", "v_x", "v_y"), ("a_0", "a_1")),
 }
 LARGEST_GAP_DEG = 170.0  # between neighbouring actuators; at 180 no activation bends a module into the gap
@@ -46,14 +46,16 @@ class Actuators(Section, frozen=True):
 class Simulation(Section, frozen=True):
     """`[simulation]`: physical parameters of the simulated robot. A robot without it can only be real."""
 
-    preset: Literal["cable", "pneumatic"]
+    preset: Literal["cable", "pneumatic", "pneumatic-2"]
 
 
-# Actuators and motion of the robots that can be simulated. `kind` under [robot], in files of version 0.1, is a preset.
-PRESETS: dict[str, tuple[str, Actuators]] = {
+# `kind` under [robot], in files of version 0.1: motion and actuators. It is the name of a preset, too.
+KINDS: dict[str, tuple[str, Actuators]] = {
     "cable": ("spatial", Actuators(drive="cables", directions_deg=(0.0, 180.0, 90.0, 270.0))),
     "pneumatic": ("planar", Actuators(drive="chambers", directions_deg=(180.0, 0.0))),
 }
+# Motion and actuators of the robots that can be simulated.
+PRESETS = {**KINDS, "pneumatic-2": KINDS["pneumatic"]}
 _DIRECTION_OF_SIDE = {"+": 180.0, "-": 0.0}  # `side` of a chamber in such a file
 
 
@@ -74,16 +76,16 @@ def with_preset(table: dict[str, Any], where: str) -> dict[str, Any]:
     if not isinstance(identity, dict) or "kind" not in identity:
         return table
     kind, others = identity["kind"], {key: value for key, value in identity.items() if key != "kind"}
-    if not isinstance(kind, str) or kind not in PRESETS:
-        expected = f"one of {', '.join(map(repr, PRESETS))}; or motion under [robot], and [actuators], in its place"
+    if not isinstance(kind, str) or kind not in KINDS:
+        expected = f"one of {', '.join(map(repr, KINDS))}; or motion under [robot], and [actuators], in its place"
         raise RobotFileError(
-            f"{where}: kind under [robot]: found {kind!r}{suggestion(kind, PRESETS)}; expected {expected}"
+            f"{where}: kind under [robot]: found {kind!r}{suggestion(kind, KINDS)}; expected {expected}"
         )
     both = [f"[{key}]" for key in ("actuators", "simulation") if key in table]
     both += ["motion under [robot]"] * ("motion" in identity)
     if both:
         raise RobotFileError(f"{where}: found kind under [robot], and {both[0]}; expected one of them: delete kind")
-    motion, actuators = PRESETS[kind]
+    motion, actuators = KINDS[kind]
     chambers = table.get("chambers", ())
     if isinstance(chambers, (list, tuple)):
         chambers = [_with_direction(chamber) for chamber in chambers]

@@ -10,7 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.control.features import REST_LIMIT_DEG, angle_between_deg, from_poses
+from modsoft.runtime.control.features import (
+    OUT_OF_PLANE_LIMIT_DEG,
+    REST_LIMIT_DEG,
+    angle_between_deg,
+    from_poses,
+    out_of_plane_deg,
+)
 from modsoft.runtime.errors import LostInRun, ModelError, ModsoftError, Tripped
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.tracking.frame import TrackerFrame
@@ -34,6 +40,7 @@ PORT_ERRORS = {0x80: "partially out of volume", 0x100: "sensor or algorithm", 0x
 NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED = "no frame", "stale", "frozen", "backwards", "delayed"
 OUT_OF_VOLUME, PORT_ERROR, INACCURATE = "out of volume", "port status", "RMS error"
 WRONG_NUMBER, HIDDEN, NOT_FINITE, DISTORTED = "wrong number of tools", "tool hidden", "not finite", "distorted"
+OUT_OF_PLANE = "out of plane"
 SWAPPED, REVERSED, JUMP = "tools too far apart", "tools in a wrong order", "jump"
 GOOD = "good"
 TRACKER_LOST = (NO_FRAME, STALE, FROZEN, BACKWARDS, DELAYED)
@@ -143,6 +150,8 @@ class FrameValidator:
         off = [abs(math.hypot(*tangent) - 1.0) for tangent in configuration.tolist()]
         if not all(each <= SIZE_TOLERANCE for each in off):  # nor where numbers too large give none
             return DISTORTED, _tool_name(int(np.argmax(off)) + 1), None
+        if self.robot.motion == "planar" and (detail := _out_of_plane(configuration)):
+            return OUT_OF_PLANE, detail, None
         if self._rest_mm is not None:
             pairs = zip(_lengths_mm(frame), self._rest_mm, strict=True)
             over = [length - (STRETCH * rest + STRETCH_MM) for length, rest in pairs]
@@ -250,6 +259,18 @@ def check_rest(configuration: Array, poses: Array) -> None:
             f"the tool of module {first + 2} hangs {-ahead_mm[first]:.0f} mm behind that of module {first + 1}, not "
             "further along; give the tools in the order base, module 1, ... with z from base to tip"
         )
+
+
+def _out_of_plane(configuration: Array) -> str:
+    """Which module of a planar robot is out of its plane, and how far; empty if none is."""
+    outside_deg = out_of_plane_deg(configuration)
+    worst = int(np.argmax(outside_deg))
+    if not outside_deg[worst] > OUT_OF_PLANE_LIMIT_DEG:
+        return ""
+    return (
+        f"module {worst + 1} by {outside_deg[worst]:.0f} degrees, at most {OUT_OF_PLANE_LIMIT_DEG:g}; the modules bend "
+        "in the x-z plane of the tools"
+    )
 
 
 def _tool_name(tool: int) -> str:

@@ -43,7 +43,7 @@ def test_shipped_model_controls_its_robot(file, robot, task, limit):
     desired = tasks.task(task, robot.motion, robot.modules)[:60]
     setup = ControllerSetup(robot, controller.actuate, controller.history, desired)
     (run,) = rollout.rollout(Fleet(robot.preset, robot.modules, 1), [setup]).robots()
-    errors = rollout.angle_errors_deg if robot.preset == "pneumatic" else rollout.configuration_errors_percent
+    errors = rollout.angle_errors_deg if robot.motion == "planar" else rollout.configuration_errors_percent
     assert errors(run.configuration, desired).mean(axis=0).max() < limit
     at_rest = np.broadcast_to(run.configuration[:1], (61, robot.modules, 3))
     assert errors(at_rest, desired).mean(axis=0).max() > 2 * limit

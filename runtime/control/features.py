@@ -1,18 +1,25 @@
 """Module configurations from poses, and the feature layout of the network (`Window`: history, S_d, label of eq. 1).
 
 A configuration is the unit tangent d3 at a module's end, in the frame of the previous module's end (module 1: of the
-base), as [v_x, v_y, v_z]. The state of the network consists of the components that `MOTIONS` lists.
+base), as [v_x, v_y, v_z]. The state of the network consists of the components that `MOTIONS` lists: of a planar module
+its unit vector in the plane (section 3.1: R^2).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from modsoft.runtime.arrays import Array
+from modsoft.runtime.errors import ModelError
 from modsoft.runtime.layout import MOTIONS
 
 COMPONENTS = ("v_x", "v_y", "v_z")
 REST_LIMIT_DEG = 60.0  # largest bending angle of a module at rest
+# Largest angle between a planar module and its plane. Two tools that are tilted by 10 degrees each, one of them turned
+# by 10 degrees about its axis as well, show 30 degrees at most.
+OUT_OF_PLANE_LIMIT_DEG = 35.0
 _STATE_INDEX = {name: [COMPONENTS.index(component) for component in each.state] for name, each in MOTIONS.items()}
 
 
@@ -66,8 +73,16 @@ def from_angles_deg(angles: Array) -> Array:
 
 
 def state_of(configuration: Array, motion: str) -> Array:
-    """State (..., S) of the network, for "planar" or "spatial" motion, from configurations (..., 3)."""
-    return np.asarray(configuration)[..., _STATE_INDEX[motion]]
+    """State (..., S) of the network, for "planar" or "spatial" motion, from configurations (..., 3). A planar one is
+    projected on the plane and normalised; its configuration must be within `OUT_OF_PLANE_LIMIT_DEG`."""
+    state = np.asarray(configuration)[..., _STATE_INDEX[motion]]
+    return state / np.linalg.norm(state, axis=-1, keepdims=True) if motion == "planar" else state
+
+
+def out_of_plane_deg(configuration: Array) -> Array:
+    """Angle (...), degrees, between configurations (..., 3) and the x-z plane."""
+    x, y, z = np.moveaxis(np.asarray(configuration), -1, 0)
+    return np.degrees(np.arctan2(np.abs(y), np.hypot(x, z)))
 
 
 def labels(modules: int) -> Array:
@@ -99,6 +114,15 @@ def features(states: Array, actions: Array) -> Array:
     flat = slots.reshape(*slots.shape[:-2], -1)
     label = np.broadcast_to(labels(flat.shape[-2])[:, None], (*flat.shape[:-1], 1))
     return np.concatenate([flat, label], axis=-1)
+
+
+def check_planar_state(names: Sequence[str], motion: str, where: object) -> None:
+    """Refuses the feature names of a planar model of releases 0.1, whose state was (v_x, v_y), with `ModelError`."""
+    if motion == "planar" and any(name.startswith("v_y[") for name in names):
+        raise ModelError(
+            f"{where}: found the planar state (v_x, v_y) of release 0.1, expected (v_x, v_z); collect data, train and "
+            "export again"
+        )
 
 
 class Window:

@@ -176,6 +176,7 @@ class Model:
         """Compares the description with the graph and with the feature layout of this version."""
         description, network = self.description, self.description.network
         components = MOTIONS[description.layout.motion]
+        features.check_planar_state(description.features, description.layout.motion, self.where)
         pairs = {
             "opset": (description.opset, model_file.OPSET),
             "IR version": (description.ir_version, model_file.IR_VERSION),

@@ -18,7 +18,7 @@ from msgspec import Meta
 from modsoft.runtime.choices import NetworkName
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_is_file
-from modsoft.runtime.layout import PRESETS, Actuators
+from modsoft.runtime.layout import KINDS, Actuators
 from modsoft.runtime.robot import Robot
 
 SCHEMA: Literal[2] = 2  # 1: releases 0.1, with the name of a kind of robot in place of the layout
@@ -127,9 +127,9 @@ def describe(text: str, where: str) -> Description:
 def _from_schema_1(table: dict[str, Any], where: str) -> dict[str, Any]:
     """A description of schema 1 in the present form."""
     others, kind = {key: value for key, value in table.items() if key != "kind"}, table.get("kind")
-    if not isinstance(kind, str) or kind not in PRESETS:
-        raise ModelError(f"{where}: for a robot of kind {kind!r}, expected one of {', '.join(PRESETS)}")
-    return {**others, "schema": SCHEMA, "layout": msgspec.to_builtins(_layout(*PRESETS[kind]))}
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise ModelError(f"{where}: for a robot of kind {kind!r}, expected one of {', '.join(KINDS)}")
+    return {**others, "schema": SCHEMA, "layout": msgspec.to_builtins(_layout(*KINDS[kind]))}
 
 
 def with_checksum(model: bytes) -> bytes:

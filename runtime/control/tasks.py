@@ -129,4 +129,6 @@ def load_task(name_or_file: str, robot: Robot) -> Array:
         raise UsageError(f"task file {name_or_file}: found 0 steps, expected at least 1")
     if desired.dtype.kind != "f" or not np.allclose(np.linalg.norm(desired, axis=-1), 1.0, atol=1e-6):
         raise UsageError(f"task file {name_or_file}: every [v_x, v_y, v_z] must be a unit vector of floats")
+    if robot.motion == "planar" and np.abs(desired[..., 1]).max() > 1e-6:
+        raise UsageError(f"task file {name_or_file}: found a v_y other than 0, expected 0 in the plane of {robot.name}")
     return desired.astype(np.float64)

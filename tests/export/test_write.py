@@ -90,6 +90,7 @@ def of(weights, change):
     ("changes", "message"),
     [
         (lambda c: {"features": c["features"][::-1]}, "features .* expected for planar"),
+        (lambda c: {"features": [name.replace("v_z", "v_y") for name in c["features"]]}, "collect data, train and exp"),
         (lambda c: {"network": {**c["network"], "history": 4}}, "expected for planar"),
         (lambda c: {"network": {**c["network"], "name": "gru"}}, "network: Invalid enum value 'gru'"),
         (lambda c: {"network": {**c["network"], "name": "lstm"}}, "lstm of None modules, expected 3"),

@@ -53,7 +53,18 @@ def test_batched_directors_equal_single_ones():
 
 def test_state_order_follows_the_motion():
     assert np.array_equal(c.state_of(np.array([1.0, 2.0, 3.0]), "spatial"), [3, 1, 2])
-    assert np.array_equal(c.state_of(np.array([1.0, 2.0, 3.0]), "planar"), [1, 2])
+    assert np.array_equal(c.state_of(np.array([3.0, 0.0, 4.0]), "planar"), [0.6, 0.8])
+
+
+@pytest.mark.parametrize("motion", ["planar", "spatial"])
+def test_state_is_a_unit_vector(motion):
+    """Of a planar module in the plane, without the component out of it."""
+    bent = np.array([[0.6 * np.cos(0.3), np.sin(0.3), 0.8 * np.cos(0.3)], [0.0, -0.6, 0.8]])
+    state = c.state_of(bent, motion)
+    np.testing.assert_allclose(np.linalg.norm(state, axis=-1), 1.0, atol=1e-15)
+    if motion == "planar":
+        np.testing.assert_allclose(state, [[0.6, 0.8], [0.0, 1.0]], atol=1e-15)
+        np.testing.assert_allclose(c.out_of_plane_deg(bent), [np.degrees(0.3), np.degrees(np.arcsin(0.6))])
 
 
 def test_labels():

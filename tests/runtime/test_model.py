@@ -57,7 +57,7 @@ def test_model_accepts_the_features_of_the_window(model):
 def test_feature_that_is_not_finite_is_an_error(model, bad):
     values = features(3)
     values[1, 4] = bad
-    with pytest.raises(ModelError, match=r"feature v_y\[t\] of module 2 is not finite"):
+    with pytest.raises(ModelError, match=r"feature v_z\[t\] of module 2 is not finite"):
         model.actuate(values)
 
 
@@ -167,6 +167,20 @@ def test_description_of_schema_1_is_read(model_file, tmp_path):
 
     old = Model.load(with_description_changed(model_file, tmp_path / "model.onnx", to_schema_1)).description
     assert old.layout == Model.load(model_file).description.layout
+
+
+@pytest.mark.parametrize("schema", [1, 2])
+def test_model_of_the_old_planar_state_is_refused_in_one_line(model_file, tmp_path, schema):
+    def to_old(table):
+        table["features"] = [name.replace("v_z", "v_y") for name in table["features"]]
+        if schema == 1:
+            del table["layout"]
+            table.update(schema=1, kind="pneumatic")
+
+    expected = r"found the planar state \(v_x, v_y\) .*, expected \(v_x, v_z\); collect data, train and export again$"
+    with pytest.raises(ModelError, match=expected) as refused:
+        Model.load(with_description_changed(model_file, tmp_path / "model.onnx", to_old))
+    assert "\n" not in str(refused.value)
 
 
 def test_robot_with_other_actuators_is_refused(model):

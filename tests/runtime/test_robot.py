@@ -17,7 +17,7 @@ from modsoft.runtime.errors import RobotFileError
     [
         ("cable-4", "cable", 4, 3, 2),
         ("cable-6", "cable", 6, 3, 2),
-        ("pneumatic-2", "pneumatic", 2, 2, 1),
+        ("pneumatic-2", "pneumatic-2", 2, 2, 1),
         ("pneumatic-3", "pneumatic", 3, 2, 1),
     ],
 )
@@ -92,7 +92,10 @@ def test_file_of_version_0_1_is_the_same_robot(name):
     old = version_0_1(robot_file.text_of(name))
     assert "kind = " in old
     assert "_deg" not in old
-    assert robot_file.parse(old) == robot_file.load(name)
+    robot = robot_file.load(name)
+    if name == "pneumatic-2":  # which has modules of its own since then
+        robot = msgspec.structs.replace(robot, simulation=robot_file.Simulation(preset="pneumatic"))
+    assert robot_file.parse(old) == robot
 
 
 def test_robot_with_three_chambers_a_module():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tracker_frames import in_space
 from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
 from modsoft.runtime import robot as robot_file
@@ -46,6 +47,14 @@ def stretched(poses):
     return poses
 
 
+def tilted_sideways(degrees):
+    """Straight but for the tool of module 2 and those below, which are tilted out of the plane."""
+    poses, angle = planar_poses((0.0, 0.0, 0.0)), np.radians(degrees)
+    tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    poses[2:, :3, :3] = poses[2:, :3, :3] @ tilt
+    return poses
+
+
 BAD = {
     safety.NO_FRAME: lambda: None,
     safety.STALE: lambda: frame(6010, 100.4 - 0.41),
@@ -56,6 +65,7 @@ BAD = {
     safety.HIDDEN: lambda: frame(6024, 100.39, valid=np.array([True, True, False, True])),
     safety.NOT_FINITE: lambda: frame(6024, 100.39, poses=one_nan(planar_poses((0.0, 0.0, 0.0)))),
     safety.DISTORTED: lambda: frame(6024, 100.39, poses=stretched(planar_poses((0.0, 0.0, 0.0)))),
+    safety.OUT_OF_PLANE: lambda: frame(6024, 100.39, poses=tilted_sideways(36.0)),
     safety.SWAPPED: lambda: frame(6024, 100.39, poses=planar_poses((0.0, 10.0, 20.0))[[0, 2, 1, 3]]),
     safety.REVERSED: lambda: frame(6024, 100.39, poses=planar_poses((0.0, 10.0, 20.0))[::-1]),
     safety.JUMP: lambda: frame(6024, 100.39, (0.0, 0.0, 120.0)),
@@ -105,6 +115,14 @@ def test_detail_names_the_tool(status, detail):
 def test_port_status_is_checked(bits, status):
     check = FrameValidator(ROBOT).check(frame(1, 100.0, port_status=(0x31, 0x31, 0x31, bits)), 100.01)
     assert check.status == status
+
+
+def test_motion_out_of_the_plane_is_limited():
+    """Tools tilted by the mounting are tolerated; a robot in space has no plane."""
+    assert FrameValidator(ROBOT).check(frame(1, 100.0, poses=tilted_sideways(34.5)), 100.01).good
+    check = FrameValidator(ROBOT).check(frame(1, 100.0, poses=tilted_sideways(-35.5)), 100.01)
+    assert (check.status, check.detail[:40]) == (safety.OUT_OF_PLANE, "module 2 by 36 degrees, at most 35; the ")
+    assert FrameValidator(in_space()).check(frame(1, 100.0, poses=tilted_sideways(80.0)), 100.01).good
 
 
 def test_limits_of_status_and_rms_are_those_of_the_robot_file():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tracker_frames import tracker_frame, with_limits
+from tracker_frames import in_space, tracker_frame, with_limits
 from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
 from modsoft.runtime import safety
@@ -227,7 +227,7 @@ def test_confirming_frames_are_compared_with_the_one_before():
         poses = planar_poses((0.0, 0.0, 90.0))
         poses[3] = turn @ poses[3]
         swinging.append(poses)
-    assert checks(settled(), swinging) == [safety.JUMP] * 3 + ["good"]
+    assert checks(settled(in_space()), swinging) == [safety.JUMP] * 3 + ["good"]
 
 
 # ---- the model's actuation

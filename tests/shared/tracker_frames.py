@@ -17,6 +17,14 @@ def tracker_frame(number: int, at_s: float, angles=(0.0, 0.0, 0.0), **changes) -
     return TrackerFrame(number, at_s, **(parts | changes))
 
 
+def in_space() -> Robot:
+    """A robot of three modules that bend in every direction, with the limits and the period of pneumatic-3."""
+    table = robot_file.load("cable-4").to_dict()
+    table["robot"]["modules"] = ROBOT.modules
+    table["loop"], table["limits"] = ROBOT.to_dict()["loop"], ROBOT.to_dict()["limits"]
+    return robot_file.from_dict(table)
+
+
 def with_limits(**limits) -> Robot:
     """pneumatic-3 with these limits."""
     table = ROBOT.to_dict()

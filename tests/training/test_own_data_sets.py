@@ -32,7 +32,7 @@ def written(path, configuration=CONFIGURATION, action=ACTION, generation=GENERAT
         for name, values in (("configuration", configuration), ("action", action)):
             if values is not ...:
                 file[name] = values
-        present = {"schema": 2, "generation": generation, "stage_borders": np.array([0, K]), "rejected": 0} | attributes
+        present = {"schema": 3, "generation": generation, "stage_borders": np.array([0, K]), "rejected": 0} | attributes
         for name, value in present.items():
             if value is not ...:
                 file.attrs[name] = json.dumps(value) if isinstance(value, dict | list) else value
@@ -47,7 +47,7 @@ VALID = {
     "four decimals": {"configuration": CONFIGURATION.round(4)},
     "generation as bytes": {"generation": np.bytes_(json.dumps(GENERATION))},
     "generation with a byte order mark": {"generation": np.bytes_(b"\xef\xbb\xbf" + json.dumps(GENERATION).encode())},
-    "small integers": {"stage_borders": np.array([0, 4, K], "u1"), "schema": np.int8(2), "rejected": np.array([0])},
+    "small integers": {"stage_borders": np.array([0, 4, K], "u1"), "schema": np.int8(3), "rejected": np.array([0])},
     "an empty stage": {"stage_borders": np.array([0, 0, K])},
     "period and steps": {"generation": {**GENERATION, "steps": K, "period_s": 0.4, "seed": None}},
 }
@@ -103,7 +103,16 @@ INVALID = {
         r"the shape \(12, 3, 1\), expected \(ep",
     ),
     "no schema": ({"schema": ...}, "no attribute schema, expected a whole number"),
-    "schema 3": ({"schema": 3}, "schema 3, expected 1 or 2"),
+    "schema 4": ({"schema": 4}, "schema 4, expected 1 to 3"),
+    "schema 0": ({"schema": 0}, "schema 0, expected 1 to 3"),
+    "old planar state": (
+        {"schema": 2},
+        r"schema 2 of a planar robot, with the state \(v_x, v_y\) .* expected schema 3, state \(v_x, v_z\); collect it",
+    ),
+    "out of plane": (
+        {"configuration": put(CONFIGURATION, (1, 4, 2), [0.0, 0.6, 0.8])},
+        "episode 1, step 4, module 3 of a planar robot is 37 degrees out of its plane; expected at most 35",
+    ),
     "schema text": ({"schema": "1"}, "schema is 1, expected a whole number"),
     "no generation settings": ({"generation": ...}, "no attribute generation, expected JSON: robot, strategy"),
     "generation in Python": ({"generation": str(GENERATION)}, "its generation settings cannot be read"),
@@ -164,17 +173,31 @@ INVALID |= {
 }
 
 
-def test_schema_1_is_read_with_its_names_mapped_to_those_of_schema_2(tmp_path):
-    settings = {**GENERATION, "steps": K, "plant": "fleet-avx2", "plant_sha256": "0" * 64}
+SPATIAL = {
+    "configuration": CONFIGURATION[:, :, [0, 1, 2, 0]],
+    "action": np.concatenate([ACTION, 0.5 * ACTION], axis=-1)[:, :, [0, 1, 2, 0]],
+}
+
+
+@pytest.mark.parametrize("schema", [2, 3])
+def test_spatial_data_of_old_schemas_are_read(tmp_path, schema):
+    generation = {**GENERATION, "robot": robot_file.load("cable-4").to_dict()}
+    data = dataset.read(written(tmp_path / "own.h5", schema=schema, generation=generation, **SPATIAL))
+    np.testing.assert_array_equal(data.configuration, SPATIAL["configuration"])
+
+
+def test_schema_1_is_read_with_its_names_mapped_to_the_present_ones(tmp_path):
+    of_cables = {**GENERATION, "robot": robot_file.load("cable-4").to_dict()}
+    settings = {**of_cables, "steps": K, "plant": "fleet-avx2", "plant_sha256": "0" * 64}
     old = {"recipe": settings, "redrawn": 4}  # words: old names
-    path = written(tmp_path / "own.h5", schema=1, generation=..., rejected=..., **old)
+    path = written(tmp_path / "own.h5", schema=1, generation=..., rejected=..., **old, **SPATIAL)
     data = dataset.read(path)
     of_simulator = {"simulator": "fleet-avx2", "simulator_sha256": "0" * 64}
-    assert data.generation == json.loads(json.dumps({**GENERATION, "steps": K, **of_simulator}))
+    assert data.generation == json.loads(json.dumps({**of_cables, "steps": K, **of_simulator}))
     assert (data.rejected, dataset.read_header(path).rejected) == (4, 4)
-    new = written(tmp_path / "new.h5", generation={**GENERATION, "steps": K, **of_simulator}, rejected=4)
+    new = written(tmp_path / "new.h5", generation={**of_cables, "steps": K, **of_simulator}, rejected=4, **SPATIAL)
     assert dataset.read(new).sha256() == data.sha256()
-    mixed = written(tmp_path / "mixed.h5", schema=1)
+    mixed = written(tmp_path / "mixed.h5", schema=1, **SPATIAL)
     with pytest.raises(ModelError, match="no attribute recipe, expected JSON"):  # words: old names
         dataset.read(mixed)
 

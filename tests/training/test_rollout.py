@@ -41,7 +41,7 @@ class RobotsOfAngles:
 
 def desired_columns(kind: str, history: int) -> list[int]:
     names = feature_names(kind, history)
-    return [names.index(f"{part}[desired]") for part in ("v_x", "v_y")]
+    return [names.index(f"{part}[desired]") for part in ("v_x", "v_z")]
 
 
 def inverse(features: np.ndarray) -> np.ndarray:
@@ -120,7 +120,9 @@ def test_features_are_those_of_the_runtime_and_the_largest_step_is_kept():
         np.testing.assert_array_equal(
             features[:, desired_columns("planar", 4)], state_of(desired[min(k + 1, 4)], "planar"), strict=True
         )
-        np.testing.assert_array_equal(features[:, names.index("v_x[t]")], run.configuration[k][:, 0])
+        np.testing.assert_array_equal(
+            features[:, names.index("v_x[t]")], state_of(run.configuration[k], "planar")[:, 0]
+        )
         # The applied actuation, not the output of the policy.
         before = run.actions[k - 1, :, 0] if k else np.zeros(2)
         np.testing.assert_array_equal(features[:, names.index("a_0[t-1]")], before)

@@ -1,7 +1,7 @@
 """Closed-loop errors of the models of tools/models on the simulated robots that they control.
 
-`python tools/bench/models.py`. The mean error of each module, base first: of the bending angle in degrees for pneumatic
-robots, of the unit vector in percent for cable robots, with the network alone and with the correction.
+`python tools/bench/models.py`. The mean error of each module, base first: of the bending angle in degrees for planar
+robots, of the unit vector in percent for others, with the network alone and with the correction.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def measured(name: str, robot_name: str, steps: int | None) -> list[dict[str, An
         for task, each in cases
     ]
     errors_of, unit = {
-        "pneumatic": (angle_errors_deg, "degrees"),
-        "cable": (configuration_errors_percent, "percent"),
-    }[robot.preset]
+        "planar": (angle_errors_deg, "degrees"),
+        "spatial": (configuration_errors_percent, "percent"),
+    }[robot.motion]
     rows = []
     rollouts = rollout(simulated(robot.preset, robot.modules, len(setups)), setups).robots()
     for (task, each), setup, motion in zip(cases, setups, rollouts, strict=True):

@@ -3,11 +3,11 @@
     configuration   (E, K + 1, N, 3) [v_x, v_y, v_z], row 0 at rest, row t + 1 reached by the action of row t
     action          (E, K, N, A) in [-1, 1]
 
-Attributes: `schema` (2); `generation` (JSON: the settings that all numbers depend on; at least `robot`, the robot file
+Attributes: `schema` (3); `generation` (JSON: the settings that all numbers depend on; at least `robot`, the robot file
 as plain values, and `strategy`, text; `simulator` and `simulator_sha256`, name and parameters, for simulated data);
 `stage_borders` (stages + 1 steps, 0 to K); `rejected` (episodes that diverged and were replaced; 0 for a real robot).
-The meaning of the numbers is checked at reading (`dataset_checks`). Files of schema 1, with other names of attributes
-(`dataset_checks.SCHEMA_1`), are read too.
+The meaning of the numbers is checked at reading (`dataset_checks`). Of robots in space, files of schema 2 and of schema
+1, with other names of attributes (`dataset_checks.SCHEMA_1`), are read too; of planar ones they are refused.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from modsoft.runtime.robot import Robot
 from modsoft.training.data import dataset_checks as checks
 from modsoft.training.data.hdf5 import own_array
 
-SCHEMA = 2
+SCHEMA = 3  # 2: with another state of planar modules; 1: with other names, too
 # Training, validation and test part have 70, 10 and 20 %, as in the paper; the second and third begin here.
 VALIDATION_FROM, TEST_FROM = 0.7, 0.8
 
@@ -137,6 +137,7 @@ def _opened(path: Path) -> Iterator[tuple[dict[str, h5py.Dataset], Header]]:
             steps = shape[1] if len(shape) == 4 else 0
             generation = checks.generation(attributes["generation"], steps, path)
             robot = robot_file.from_dict(generation["robot"], "data set")
+            checks.planar_state(attributes["schema"], SCHEMA, robot, path)
             checks.shapes(arrays["configuration"].shape, shape, robot, path)
             borders = checks.stage_borders(attributes["stage_borders"], steps, path)
             rejected = checks.whole_number("rejected", attributes["rejected"], path)
@@ -159,9 +160,10 @@ def read(path: Path) -> DataSet:
     """
     with _opened(path) as (arrays, header):
         configuration, action = (np.asarray(arrays[name], np.float64) for name in ("configuration", "action"))
-    checks.configuration(configuration, path)
+    data = DataSet(header.generation, configuration, action, header.stage_borders, header.rejected)
+    checks.configuration(configuration, data.robot.motion, path)
     checks.action(action, path)
-    return DataSet(header.generation, configuration, action, header.stage_borders, header.rejected)
+    return data
 
 
 @dataclass(frozen=True)

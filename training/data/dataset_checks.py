@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.control.features import REST_LIMIT_DEG
+from modsoft.runtime.control.features import OUT_OF_PLANE_LIMIT_DEG, REST_LIMIT_DEG, out_of_plane_deg
 from modsoft.runtime.errors import ModelError, RobotFileError
 from modsoft.runtime.files import decoded
 
@@ -27,7 +27,7 @@ ATTRIBUTES = {
     "stage_borders": "whole numbers from 0 to the steps of an episode",
     "rejected": "a whole number, 0 for a real robot",
 }
-# Names of schema 1, and those of schema 2 for the same: attributes, and keys of the generation settings.
+# Names of schema 1, and the present ones for the same: attributes, and keys of the generation settings.
 SCHEMA_1 = {"recipe": "generation", "redrawn": "rejected"}  # words: old names
 SCHEMA_1_SETTINGS = {"plant": "simulator", "plant_sha256": "simulator_sha256"}
 LENGTH_TOLERANCE = 1e-3  # of a unit vector: allows half precision and numbers with four decimals
@@ -44,7 +44,7 @@ class Generation(msgspec.Struct):
 
 
 def attributes(in_file: Mapping[str, Any], schema: int, where: Path) -> dict[str, Any]:
-    """All of `ATTRIBUTES` of a file of this schema, or of schema 1, under their present names."""
+    """All of `ATTRIBUTES` of a file of this schema, or of an older one, under their present names."""
     is_old = "schema" in in_file and whole_number("schema", in_file["schema"], where) == 1
     old_names = {new: old for old, new in SCHEMA_1.items()} if is_old else {}
     names = {name: old_names.get(name, name) for name in ATTRIBUTES}
@@ -54,8 +54,8 @@ def attributes(in_file: Mapping[str, Any], schema: int, where: Path) -> dict[str
                 f"{where}: not a data set of modsoft-collect: no attribute {name_in_file}, expected {ATTRIBUTES[name]}"
             )
     found = whole_number("schema", in_file["schema"], where)
-    if found not in (1, schema):
-        raise ModelError(f"{where}: schema {found}, expected 1 or {schema}; collect it again, or update modsoft")
+    if not 1 <= found <= schema:
+        raise ModelError(f"{where}: schema {found}, expected 1 to {schema}; collect it again, or update modsoft")
     return {name: in_file[name_in_file] for name, name_in_file in names.items()}
 
 
@@ -93,6 +93,15 @@ def generation(value: Any, steps: int, where: Path) -> dict[str, Any]:
     return {SCHEMA_1_SETTINGS.get(name, name): setting for name, setting in settings.items()}
 
 
+def planar_state(found: Any, schema: int, robot: robot_file.Robot, where: Path) -> None:
+    """Refuses planar data of releases 0.1, whose state was (v_x, v_y)."""
+    if robot.motion == "planar" and int(np.asarray(found).item()) < schema:
+        raise ModelError(
+            f"{where}: schema {int(np.asarray(found).item())} of a planar robot, with the state (v_x, v_y) of release "
+            f"0.1; expected schema {schema}, state (v_x, v_z); collect it again"
+        )
+
+
 def stage_borders(value: Any, steps: int, where: Path) -> NDArray[np.int64]:
     """First step of each stage, and the end (stages + 1,)."""
     borders = np.asarray(value)
@@ -117,8 +126,8 @@ def shapes(configuration: tuple[int, ...], action: tuple[int, ...], robot: robot
             raise ModelError(f"{where}: {name} has the shape {shape}, expected {wanted} for robot {robot.name}")
 
 
-def configuration(values: Array, where: Path) -> None:
-    """Finite unit vectors (E, K + 1, N, 3), each episode from rest."""
+def configuration(values: Array, motion: str, where: Path) -> None:
+    """Finite unit vectors (E, K + 1, N, 3), each episode from rest, and of planar modules in the plane."""
     _finite("configuration", values, where)
     length = np.linalg.norm(values, axis=-1)
     wrong = np.argwhere(np.abs(length - 1.0) > LENGTH_TOLERANCE)
@@ -137,6 +146,14 @@ def configuration(values: Array, where: Path) -> None:
             f"{where}: episode {episode} begins with module {module + 1} bent by {bent_deg[episode, module]:.0f} "
             f"degrees, expected it at rest (at most {REST_LIMIT_DEG:g}); is the order [v_x, v_y, v_z], v_z along the "
             "robot?"
+        )
+    wrong = np.argwhere(out_of_plane_deg(values) > OUT_OF_PLANE_LIMIT_DEG)
+    if motion == "planar" and len(wrong):
+        episode, step, module = map(int, wrong[0])
+        raise ModelError(
+            f"{where}: configuration of episode {episode}, step {step}, module {module + 1} of a planar robot is "
+            f"{out_of_plane_deg(values[episode, step, module]):.0f} degrees out of its plane; expected at most "
+            f"{OUT_OF_PLANE_LIMIT_DEG:g}, v_y about 0"
         )
 
 

@@ -193,5 +193,5 @@ class Arm:
         return values
 
     def _pneumatic_only(self) -> None:
-        if self.kind != "pneumatic":
+        if self.parameters.actuators.full_stress_pa > 0.0:
             raise ValueError(f"a {self.kind} robot has no chambers")

@@ -152,7 +152,7 @@ CABLE = PlantParameters(
 )
 
 # A robot like that of section 3.1: two opposite chambers a module between stiff connectors, hanging from a stick. The
-# paper gives pressures and reach, not the modules; these are chosen so that three modules reach 6, 36 and over 90
+# paper gives pressures and reach, not the modules; these are chosen so that three modules reach 5.9, 36 and 90
 # degrees, base first, and the tasks stay within the pressures. Density and modulus are those of a hollow section of
 # soft silicone; the connectors' inertia is spread over the module. Linear damping represents the losses in the wall.
 PNEUMATIC = PlantParameters(
@@ -160,7 +160,7 @@ PNEUMATIC = PlantParameters(
     elements=6,
     radius_m=0.015,
     density_kg_m3=300.0,
-    youngs_modulus_pa=97e3,
+    youngs_modulus_pa=100.8e3,
     gravity_m_s2=9.81,
     damping_n_s_m2=6.0,
     torque_damping_n_s=0.02,
@@ -180,12 +180,16 @@ PNEUMATIC = PlantParameters(
     rotary_inertia_ratio=5.0,
     connector_mass_kg=0.0035,
     tip_mass_kg=0.0005,
-    stiffening_weight_n=0.1518,
-    stiffening_power=3.0,
+    stiffening_weight_n=0.1555,
+    stiffening_power=3.04,
     stiffest_ratio=9.0,  # the third module from the tip has 8.6
     friction_n_m2=1.3e-3,
     friction_curvature_per_m=1.9,
     settling_slices=60,
 )
 
-PARAMETERS = {"cable": CABLE, "pneumatic": PNEUMATIC}
+# The robot of two modules: 33 and 75 degrees (`down` takes the first one to 32.4). No one set of modules has the reach
+# of both robots: the modules at the tip carry the same weight, and reach 90 degrees in one and 75 in the other.
+PNEUMATIC_2 = dataclasses.replace(PNEUMATIC, youngs_modulus_pa=118.2e3, stiffening_weight_n=0.1735)
+
+PARAMETERS = {"cable": CABLE, "pneumatic": PNEUMATIC, "pneumatic-2": PNEUMATIC_2}
