@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from corrupted_models import corrupted, with_description_changed, with_fault_above
+from corrupted_models import corrupted, with_description_changed, with_fault_below
 from mega_in_run import side_by_side
 from runtime_in_run import SCRIPT, Run, Stand, retry_until_begun
 from virtual_loop import World
@@ -182,7 +182,7 @@ def test_row_22_model_gives_nan_on_the_board(matrix_row, full, model_file, tmp_p
     def attempt(number):
         folder = Path(tmp_path / str(number))
         folder.mkdir(exist_ok=True)
-        model = with_fault_above(model_file, folder / "model.onnx", values[number], threshold=0.2)
+        model = with_fault_below(model_file, folder / "model.onnx", values[number], threshold=-0.2)
         with Stand() as stand, Run(stand, model, folder) as run:
             assert run.wait_exit()[0] == 65, run.output
             assert "the actuation is not finite" in run.output or "nothing of it was sent" in run.output

@@ -47,9 +47,9 @@ def write_model(path, model, table):
     return path
 
 
-def with_fault_above(model_file, path, value, threshold):
+def with_fault_below(model_file, path, value, threshold):
     """Writes a copy of the model to `path` that passes every check at start, and whose output for three modules is
-    `value` while any feature except the label exceeds `threshold`. (The golden pairs have two and four modules.)"""
+    `value` while any feature except the label is below `threshold`. (The golden pairs have two and four modules.)"""
     model = onnx.load(model_file)
     graph = model.graph
     for node in graph.node:
@@ -72,9 +72,9 @@ def with_fault_above(model_file, path, value, threshold):
             helper.make_node("Slice", ["shape", "one", "two"], ["modules"]),
             helper.make_node("Equal", ["modules", "three"], ["are_three"]),
             helper.make_node("Slice", [model_files.FEATURES, "zero", "last", "two"], ["unlabelled"]),
-            helper.make_node("ReduceMax", ["unlabelled"], ["largest"], keepdims=0),
-            helper.make_node("Greater", ["largest", "threshold"], ["is_above"]),
-            helper.make_node("And", ["are_three", "is_above"], ["is_fault"]),
+            helper.make_node("ReduceMin", ["unlabelled"], ["least"], keepdims=0),
+            helper.make_node("Less", ["least", "threshold"], ["is_below"]),
+            helper.make_node("And", ["are_three", "is_below"], ["is_fault"]),
             helper.make_node("Where", ["is_fault", "fault", "regular"], [model_files.ACTUATION]),
         ]
     )
