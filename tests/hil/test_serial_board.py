@@ -15,11 +15,11 @@ import pytest
 import serial
 
 from modsoft.hil import cli, record
-from modsoft.hil.board import emulator, toolchain
+from modsoft.hil.board import emulator, serial_board, toolchain
 from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.hil.board.serial_board import SerialBoard
 from modsoft.runtime import robot as robot_file
-from modsoft.runtime.board import discovery
+from modsoft.runtime.board import discovery, ports
 from modsoft.runtime.board.codec import encode
 from modsoft.runtime.board.protocol import PROTOCOL_HASH, Hello, State, Status
 from modsoft.runtime.errors import DeviceAbsent, PortBusy, ProtocolMismatch, UsageError
@@ -48,6 +48,11 @@ def wait_until(true):
     while not true():
         assert time.monotonic() < deadline, "it did not happen in time"
         time.sleep(0.002)
+
+
+def wait_until_open(forwarding):
+    """Not `Device.is_open`: pyserial discards what arrives before the end of its opening."""
+    wait_until(lambda: any(event["event"] == "host-open" for event in forwarding.trace))
 
 
 class Device:
@@ -183,7 +188,7 @@ def test_other_device_is_refused(device, monkeypatch):
 def test_bytes_pass_unmodified_in_both_directions(device, forwarding):
     every_byte = bytes(range(256)) * 3
     with serial.Serial(forwarding.port, 250_000, timeout=TIMEOUT_S) as host:
-        wait_until(device.is_open)
+        wait_until_open(forwarding)
         host.write(every_byte)
         assert device.read(len(every_byte)) == every_byte
         os.write(device.master, every_byte)
@@ -196,30 +201,35 @@ def test_status_moves_the_simulated_robot(device, forwarding):
     reported = []
     forwarding.on_event = reported.append
     with serial.Serial(forwarding.port, 250_000):
-        # Not device.is_open: pyserial discards what arrives before the end of its opening.
-        wait_until(lambda: any(event["event"] == "host-open" for event in forwarding.trace))
+        wait_until_open(forwarding)
         os.write(device.master, encode(hello(boot_id=8)) + encode(status([3000, 0, 1500])))
         wait_until(lambda: any(event["event"] == "status" for event in reported))
     assert forwarding.duties() == [0.1, 0, 0.05] + [0] * 8
     assert [event["event"] for event in reported][:3] == ["host-open", "hello", "status"]
 
 
-def test_each_opening_resets_the_board_and_venting_is_seen_after_the_close(device, forwarding):
+def test_each_opening_resets_the_board_and_venting_is_seen_after_the_close(device, forwarding, monkeypatch):
+    was_closed = []  # DTR of a MEGA has fallen
+
+    def open_port(*arguments):
+        was_closed.append(not device.is_open())
+        return ports.open_port(*arguments)
+
+    monkeypatch.setattr(serial_board, "open_port", open_port)
     with serial.Serial(forwarding.port, 250_000):
-        wait_until(device.is_open)
+        wait_until_open(forwarding)
     wait_until(lambda: forwarding.trace[-1]["event"] == "host-close")
     os.write(device.master, encode(status([0])))
     wait_until(lambda: forwarding.trace[-1]["event"] == "status")
     assert device.is_open()
-    host = serial.Serial(forwarding.port, 250_000)
-    wait_until(lambda: not device.is_open())  # DTR of a MEGA falls
-    wait_until(device.is_open)
-    host.close()
+    with serial.Serial(forwarding.port, 250_000):
+        wait_until(lambda: forwarding.trace[-1]["event"] == "host-open")
+    assert was_closed == [True, True]
 
 
 def test_pulled_cable_reaches_the_runtime(device, forwarding):
     host = serial.Serial(forwarding.port, 250_000, timeout=TIMEOUT_S)
-    wait_until(device.is_open)
+    wait_until_open(forwarding)
     device.close()
     with pytest.raises(serial.SerialException):
         host.read(1)
