@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from modsoft.runtime.errors import ModelError, OutputError
-from modsoft.study import figures, oracle, plan, results, rollouts, stages
+from modsoft.study import figures, measurements, oracle, plan, results, rollouts, stages
 from modsoft.study.cells import pick
 from modsoft.study.paths import Folder
 from modsoft.training import checkpoint, made_from
+from modsoft.training.settings import PRECISIONS
 
 pytestmark = pytest.mark.slow
 
@@ -135,6 +136,13 @@ def test_estimation_errors_are_those_of_the_test_part_of_training(shared_study):
             np.testing.assert_allclose([each.std for each in records], provenance["errors_std_percent"], atol=1e-4)
         else:
             assert len(records) == 4
+
+
+def test_results_state_the_settings_of_the_training(shared_study, monkeypatch):
+    trained = results.load(shared_study / "results.json").about.models[0].settings
+    other = next(precision for precision in PRECISIONS if precision != trained.precision)
+    monkeypatch.setattr(stages, "fastest_precision", lambda: other)  # measured on another machine
+    assert measurements.about(PLAN, Folder(shared_study)).models[0].settings == trained
 
 
 def test_every_number_of_the_paper_is_in_the_results(shared_study):

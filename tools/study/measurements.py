@@ -54,7 +54,8 @@ def about(plan: Plan, folder: Folder) -> About:
     models = []
     for model in plan.models:
         provenance = checkpoints.load(folder.checkpoint(model))["provenance"]
-        settings = msgspec.convert(asdict(stages.settings_of(plan, model)), Settings)
+        # Not those of the plan: their precision depends on the machine, which may not be the one of the training.
+        settings = msgspec.convert(provenance, Settings)
         models.append(msgspec.convert({**provenance, "name": model.name, "settings": settings}, Model))
     return About(
         code_version=version("modsoft"),
