@@ -9,8 +9,12 @@
  *   repeat     valid frames again: sent twice, out of order, of an earlier session
  *
  * Each try sends one such frame to a running board, and then a valid SET with new set-points. Prints one JSON object:
- *   tries, whole (arrived unchanged: only a delimiter was changed), wrong (a corrupted frame accepted, or a repeated
- *   one applied), lost (valid SETs not applied), silences, latest_vent_ms (after the last valid frame).
+ *   tries
+ *   whole           frames accepted because only a delimiter was changed
+ *   wrong           corrupted frames accepted, repeated frames applied
+ *   lost            valid SETs not applied
+ *   silences
+ *   latest_vent_ms  from the last valid frame of a silence until the valves are at 0
  * Exit code 1 if wrong or lost is not 0; aborts if a rule of watched.h is violated. */
 #include <stdio.h>
 #include <stdlib.h>
@@ -173,7 +177,6 @@ static void silence(void) {
 }
 
 static void run(enum kind kind, uint64_t tries) {
-  uint8_t sink[sizeof host.board.tx];
   watched_begin(&host, 0);
   for (uint64_t done = 0; done < tries; done++) {
     struct sent good;
@@ -195,7 +198,9 @@ static void run(enum kind kind, uint64_t tries) {
     good = next_set(1);
     send_good(&good);
     pass();
-    for (uint32_t i = 0; done % 4 == 0 && i < sizeof sink && supervisor_next_byte(&host.board) >= 0; i++) {
+    if (done % 4 == 0) { /* the host reads too rarely, so that the queue is full at times */
+      while (supervisor_next_byte(&host.board) >= 0) {
+      }
     }
   }
 }

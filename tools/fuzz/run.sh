@@ -19,7 +19,7 @@ if [ $# -gt 0 ]; then
         apt-get update -qq
         DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
         case $1 in
-        clang) exec "$0" "$seconds" ;; # now the version of the library is known
+        clang) exec tools/fuzz/run.sh "$seconds" ;; # now the version of the library is known
         esac
     else
         echo "fuzz: a Debian package is missing; run: sudo apt-get install $*" >&2
