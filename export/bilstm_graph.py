@@ -45,21 +45,21 @@ def build(weights: Weights, sizes: Network, description: str) -> onnx.ModelProto
     final_h, final_c = [], []
     pair_shape = graph.whole_numbers("both_directions", [-1, 1, 2 * hidden])
     for layer in range(layers):
-        here = f"layer_{layer + 1}"
-        h_rows = graph.whole_numbers(f"{here}_h_rows", [layer, 2 * layers + layer])
-        c_rows = graph.whole_numbers(f"{here}_c_rows", [layers + layer, 3 * layers + layer])
-        h_initial = graph.add("Gather", [received, h_rows], f"{here}_h_initial", axis=0)  # (2, 1, H): base, tip
-        c_initial = graph.add("Gather", [received, c_rows], f"{here}_c_initial", axis=0)
-        final_h.append(f"{here}_h")
-        final_c.append(f"{here}_c")
+        name = f"layer_{layer + 1}"
+        h_rows = graph.whole_numbers(f"{name}_h_rows", [layer, 2 * layers + layer])
+        c_rows = graph.whole_numbers(f"{name}_c_rows", [layers + layer, 3 * layers + layer])
+        h_initial = graph.add("Gather", [received, h_rows], f"{name}_h_initial", axis=0)  # (2, 1, H): base, tip
+        c_initial = graph.add("Gather", [received, c_rows], f"{name}_c_initial", axis=0)
+        final_h.append(f"{name}_h")
+        final_c.append(f"{name}_c")
         graph.add(
             "LSTM",
-            [sequence, f"{here}_W", f"{here}_R", f"{here}_B", "", h_initial, c_initial],
-            [f"{here}_Y", final_h[-1], final_c[-1]],  # Y (N, 2, 1, H)
+            [sequence, f"{name}_W", f"{name}_R", f"{name}_B", "", h_initial, c_initial],
+            [f"{name}_Y", final_h[-1], final_c[-1]],  # Y (N, 2, 1, H)
             direction="bidirectional",
             hidden_size=hidden,
         )
-        sequence = graph.add("Reshape", [f"{here}_Y", pair_shape], here)  # (N, 1, 2 H)
+        sequence = graph.add("Reshape", [f"{name}_Y", pair_shape], name)  # (N, 1, 2 H)
 
     graph.add("MatMul", [sequence, "head_weight"], "head_product")
     graph.add("Add", ["head_product", "head_bias"], "head")  # (N, 1, A)
@@ -69,7 +69,7 @@ def build(weights: Weights, sizes: Network, description: str) -> onnx.ModelProto
     graph.add("Concat", final_h + final_c, "final_states", axis=0)  # (4 L, 1, H): h, then c; by layer: tip, base
     sent = graph.add("Add", ["final_states", nan_term], "sent")
     for name in TO_NEIGHBOURS:
-        first = 2 * layers * name.startswith("c") + name.endswith("base")
+        first = (2 * layers if name.startswith("c") else 0) + (1 if name.endswith("base") else 0)
         rows = graph.whole_numbers(f"{name}_rows", [first + 2 * layer for layer in range(layers)])
         graph.add("Gather", [sent, rows], name, axis=0)
 

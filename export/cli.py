@@ -60,12 +60,12 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
         f"largest difference from torch, relative to the output range (limit {report.bound:.1e}; "
         f"of torch in float32 {report.torch_error:.1e}):"
     )
-    if description.network.modules is None and (skipped := set(parity.MODULES) - set(report.fused)):
+    if description.network.modules is None and (skipped := set(parity.MODULES) - set(report.whole)):
         numbers = ", ".join(map(str, sorted(skipped)))
         click.echo(f"not compared for {numbers} modules: this network amplifies the rounding of float32 too much")
-    click.echo("  modules     " + "".join(f"{modules:>10}" for modules in report.fused))
+    click.echo("  modules     " + "".join(f"{modules:>10}" for modules in report.whole))
     for name, errors in (
-        ("one run", report.fused),
+        ("one run", report.whole),
         ("chain", report.chain),
         ("sweep short", report.one_sweep_fewer),
     ):

@@ -57,10 +57,10 @@ def build(weights: Weights, sizes: Network, description: str) -> onnx.ModelProto
     for prefix, sequence in zip(units, sequences, strict=True):
         graph.constants |= nodes.initializers(weights, sizes.layers, DIRECTIONS, prefix)
         for layer in range(sizes.layers):
-            here = f"{prefix}layer_{layer + 1}"
-            inputs = [sequence, f"{here}_W", f"{here}_R", f"{here}_B"]
-            graph.add("LSTM", inputs, [f"{here}_Y"], hidden_size=sizes.hidden)  # Y (T, 1, 1, H)
-            sequence = graph.add("Reshape", [f"{here}_Y", hidden_shape], here)  # (T, 1, H)
+            name = f"{prefix}layer_{layer + 1}"
+            inputs = [sequence, f"{name}_W", f"{name}_R", f"{name}_B"]
+            graph.add("LSTM", inputs, [f"{name}_Y"], hidden_size=sizes.hidden)  # Y (T, 1, 1, H)
+            sequence = graph.add("Reshape", [f"{name}_Y", hidden_shape], name)  # (T, 1, H)
         graph.add("Gather", [sequence, last], f"{prefix}last_slot", axis=0)  # (1, H)
         graph.add("MatMul", [f"{prefix}last_slot", f"{prefix}head_weight"], f"{prefix}head_product")
         graph.add("Add", [f"{prefix}head_product", f"{prefix}head_bias"], f"{prefix}head")

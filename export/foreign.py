@@ -12,7 +12,7 @@ from modsoft.runtime.errors import ModelError
 
 Weights = dict[str, torch.Tensor]
 
-ANCHOR = "lstm.weight_hh_l0"  # its prefix is the prefix of all names
+ANCHOR = "lstm.weight_hh_l0"  # every biLSTM has it; what precedes it is the prefix of all names
 DEPTH = 4  # of nested dicts
 
 
@@ -30,8 +30,8 @@ def state_dicts(content: Any, key: str = "", depth: int = DEPTH) -> Iterator[tup
 
 
 def weights_of(content: dict[str, Any], key: str | None, where: Path) -> Weights:
-    """Weights of the biLSTM, float32, with the names of modsoft-train. key: as in `state_dicts`, None for the only one.
-    `ModelError` if there is none, or another network."""
+    """Weights of the biLSTM, float32, with the names of modsoft-train. key: as in `state_dicts`; None selects the only
+    state dict. `ModelError` without a state dict, with several and no key, and for another network."""
     candidates = dict(state_dicts(content))
     keys = ", ".join(repr(each) for each in candidates if each)
     if key is not None and key not in candidates:
@@ -75,13 +75,17 @@ def _content(content: dict[str, Any], keys: str) -> str:
     return f"found one under {keys}" if keys else f"found {', '.join(names) or 'nothing'}{rest}"
 
 
+def layers_of(weights: Weights) -> int:
+    """The number of LSTM layers, from the names of the weights."""
+    return sum(name.startswith("lstm.weight_hh_l") and not name.endswith("_reverse") for name in weights)
+
+
 def _check_names(weights: Weights, where: Path) -> None:
     """`ModelError` unless names, types and dimensions are those of a biLSTM."""
-    layers = sum(name.startswith("lstm.weight_hh_l") and not name.endswith("_reverse") for name in weights)
     parts = [
         f"{part}_l{layer}{direction}"
         for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-        for layer in range(layers)
+        for layer in range(layers_of(weights))
         for direction in ("", "_reverse")
     ]
     expected = {"head.weight", "head.bias", *(f"lstm.{part}" for part in parts)}

@@ -36,9 +36,11 @@ class MetaFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def read(path: Path, meta: Path | None = None) -> dict[str, Any]:
-    """Reads and checks the checkpoint at `path`, or with `meta` one made from a bare state dict. `ModelError`."""
+    """The checkpoint at `path`; with `meta`, a checkpoint of the state dict at `path` and the values in `meta`.
+    `ModelError` for any other file and for inconsistent content."""
     if meta is None:
         content = checkpoints.read(path)
+        # With one entry missing it is a damaged checkpoint of modsoft-train, which `checkpoints.load` refuses.
         if len(content.keys() & checkpoints.KEYS.keys()) < len(checkpoints.KEYS) - 1:
             foreign.refuse(content, path, META_KEYS)
         checkpoint = checkpoints.load(path)
@@ -77,7 +79,6 @@ def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
     if content.keys() >= checkpoints.KEYS.keys():
         raise ModelError(f"{path}: found a complete checkpoint, expected a bare state dict; leave --meta out")
     weights = foreign.weights_of(content, options.weights, path)
-    layers = sum(name.startswith("lstm.weight_hh_l") and not name.endswith("_reverse") for name in weights)
     robot = _robot(meta, options.robot)
     return {
         "schema": checkpoints.SCHEMA,
@@ -86,7 +87,7 @@ def _with_meta(path: Path, meta: Path) -> dict[str, Any]:
             "name": "bilstm",
             "feature_size": weights["lstm.weight_ih_l0"].shape[1],
             "action_size": weights["head.weight"].shape[0],
-            "layers": layers,
+            "layers": foreign.layers_of(weights),
             "hidden": weights["lstm.weight_hh_l0"].shape[1],
             "dropout": 0.0,
             "history": options.history,

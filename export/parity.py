@@ -25,21 +25,21 @@ from modsoft.runtime.control.model_file import FEATURES, FROM_NEIGHBOURS, IR_VER
 from modsoft.runtime.errors import ModelError
 
 MODULES = (2, 3, 4, 5, 6, 7, 8, 16, 64)  # for a network for any number
-ALWAYS = 4  # modules up to which a comparison is required
-COMPARABLE = 1e-4  # largest error of torch in float32 for a meaningful comparison, relative to the output range
-DRAWS = 4  # feature sets for each of them; as many in total for a fixed number of modules
+REQUIRED_MODULES = 4  # modules up to which a comparison is required
+COMPARABLE_ERROR = 1e-4  # largest error of torch in float32 for a meaningful comparison, relative to the output range
+DRAWS = 4  # random feature sets for each of MODULES; a network for a fixed number gets all of them
 SLOT_SPREAD = 0.1  # half of the largest difference between the slots of a window
 SEED = 20240229
 
-Draws = dict[int, list[Array]]
+Draws = dict[int, list[Array]]  # by number of modules
 
 
 @dataclass(frozen=True)
 class Reference:
     """Output of torch in float64, and the permitted error of float32."""
 
-    features: dict[int, list[Array]]  # by number of modules: DRAWS of (N, F), float32 values
-    actuation: dict[int, list[Array]]  # likewise (N, A)
+    features: Draws  # DRAWS of (N, F), float32 values
+    actuation: Draws  # DRAWS of (N, A)
     torch_error: float  # of torch in float32, relative to the output range
     output_range: float  # largest minus smallest actuation
 
@@ -54,10 +54,10 @@ class Reference:
         """The bound in units of actuation."""
         return self.bound * self.output_range
 
-    def error(self, outputs: dict[int, list[Array]]) -> dict[int, float]:
+    def error(self, outputs: Draws) -> dict[int, float]:
         """Largest error for each number of modules, relative to the output range."""
         return {
-            modules: max(np.abs(f - a).max() for f, a in zip(draws, self.actuation[modules], strict=True))
+            modules: max(np.abs(a - b).max() for a, b in zip(draws, self.actuation[modules], strict=True))
             / self.output_range
             for modules, draws in outputs.items()
         }
@@ -65,11 +65,12 @@ class Reference:
 
 @dataclass(frozen=True)
 class Report:
-    """Errors by number of modules, relative to the output range."""
+    """Errors by number of modules, relative to the output range: of one run over all modules, of the chain of single
+    modules, and of the chain without its last sweep."""
 
     bound: float
     torch_error: float
-    fused: dict[int, float]
+    whole: dict[int, float]
     chain: dict[int, float]
     one_sweep_fewer: dict[int, float]
 
@@ -111,16 +112,19 @@ def reference(network: torch.nn.Module, sizes: Network) -> Reference:
 
 
 def _comparable(features: Draws, actuation: Draws, rounded: Draws) -> tuple[Draws, Draws, Draws]:
-    """Drops the numbers of modules beyond `ALWAYS` for which torch in float32 is far from float64, because the network
-    amplifies rounding too much for a comparison."""
+    """Drops the numbers of modules beyond `REQUIRED_MODULES` for which torch in float32 is far from float64: there the
+    network amplifies rounding too much for a comparison."""
     comparable = {
         n
         for n, draws in actuation.items()
-        if n <= ALWAYS
-        or max(np.abs(r - a).max() for r, a in zip(rounded[n], draws, strict=True)) <= COMPARABLE * np.ptp(draws)
+        if n <= REQUIRED_MODULES
+        or max(np.abs(r - a).max() for r, a in zip(rounded[n], draws, strict=True)) <= COMPARABLE_ERROR * np.ptp(draws)
     }
-    kept = ({n: draws for n, draws in each.items() if n in comparable} for each in (features, actuation, rounded))
-    return next(kept), next(kept), next(kept)
+
+    def kept(draws: Draws) -> Draws:
+        return {n: draws[n] for n in draws if n in comparable}
+
+    return kept(features), kept(actuation), kept(rounded)
 
 
 def weights_sha256(weights: Weights) -> str:
@@ -138,11 +142,11 @@ def verify(path: Path, network: torch.nn.Module, sizes: Network, expected: Refer
     check_graph(path)
     check_weights(path, weights, sizes)
     unit = open_unit(path.read_bytes(), str(path))
-    fused = check_fused(unit, expected)
+    whole = check_whole(unit, expected)
     # A network for a fixed number of modules has no neighbours.
     chain, one_sweep_fewer = check_chain(unit, expected) if isinstance(unit, Unit) else ({}, {})
     check_nan(unit, expected)
-    return Report(expected.bound, expected.torch_error, fused, chain, one_sweep_fewer)
+    return Report(expected.bound, expected.torch_error, whole, chain, one_sweep_fewer)
 
 
 def check_graph(path: Path) -> None:
@@ -173,15 +177,15 @@ def check_weights(path: Path, weights: Weights, sizes: Network) -> None:
             raise ModelError(f"weight {name}: {changed} of {expected.size} values differ from the checkpoint")
 
 
-def check_fused(unit: Unit | FixedSizeUnit, expected: Reference) -> dict[int, float]:
+def check_whole(unit: Unit | FixedSizeUnit, expected: Reference) -> dict[int, float]:
     """One run over all modules gives the actuation of torch."""
     outputs = {n: [unit.whole(x) for x in draws] for n, draws in expected.features.items()}
     return _within(expected.error(outputs), expected.bound, "all modules in one run")
 
 
 def check_chain(unit: Unit, expected: Reference) -> tuple[dict[int, float], dict[int, float]]:
-    """A chain of single modules gives the same after L + 1 sweeps, and something else after L, which shows that the
-    neighbours' states are used."""
+    """A chain of single modules gives the actuation of torch after L + 1 sweeps, and another one after L, which shows
+    that the neighbours' states are used. Returns the errors of both."""
     first = {n: draws[0] for n, draws in expected.features.items()}
     one = Reference(expected.features, {n: a[:1] for n, a in expected.actuation.items()}, 0.0, expected.output_range)
     outputs = {n: [unit.chain(x)] for n, x in first.items()}

@@ -51,7 +51,7 @@ def test_description_has_the_number_of_modules(exported, name):
     description = exported[name][1].description
     assert (description.network.name, description.network.modules, description.sequence_axis) == (name, N, "time")
     assert [len(pair.features) for pair in description.golden] == [N]
-    assert list(exported[name][1].report.fused) == [N]
+    assert list(exported[name][1].report.whole) == [N]
 
 
 @pytest.mark.parametrize("name", FIXED)
@@ -70,10 +70,10 @@ def test_check_refuses_a_robot_of_another_number_of_modules(exported):
 
 
 @pytest.mark.parametrize("name", FIXED)
-def test_full_size(tmp_path, make_checkpoint, name):
-    """Table S1's network, also with weights large enough to saturate it."""
+def test_network_of_table_s1_is_exported_within_the_bound(tmp_path, make_checkpoint, name):
+    """Also with weights large enough to saturate it."""
     result = export(make_checkpoint(tmp_path / "model.pt", "cable-4", 5, layers=4, hidden=128, gain=3.0, name=name))
-    assert max(result.report.fused.values()) <= result.report.bound
+    assert max(result.report.whole.values()) <= result.report.bound
 
 
 def change(model, name, function):

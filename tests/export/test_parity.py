@@ -137,7 +137,7 @@ CHECKS = {
         "one_changed_weight",
         "missing_weight",
     },
-    "fused": {
+    "whole": {
         "swapped_gates",
         "swapped_directions",
         "dropped_recurrent_bias",
@@ -169,8 +169,8 @@ def run(check, path, network, sizes, expected):
         return parity.check_graph(path)
     if check == "weights":
         return parity.check_weights(path, weights, sizes)
-    if check == "fused":
-        return parity.check_fused(open_unit(path.read_bytes()), expected)
+    if check == "whole":
+        return parity.check_whole(open_unit(path.read_bytes()), expected)
     if check == "chain":
         return parity.check_chain(open_unit(path.read_bytes()), expected)
     return parity.check_nan(open_unit(path.read_bytes()), expected)
@@ -198,7 +198,7 @@ def test_every_fault_is_detected_by_a_check():
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_export_refuses_and_leaves_nothing(fault, exported, tmp_path, monkeypatch):
+def test_export_refuses_each_fault_and_leaves_no_file(fault, exported, tmp_path, monkeypatch):
     checkpoint, *_ = exported
     build = bilstm_graph.build
 
@@ -239,7 +239,7 @@ def test_network_that_ignores_its_neighbours_is_refused(exported, tmp_path, make
     expected = parity.reference(network, sizes)
     weights = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
     unit = open_unit(bilstm_graph.build(weights, sizes, "{}").SerializeToString())
-    parity.check_fused(unit, expected)
+    parity.check_whole(unit, expected)
     with pytest.raises(ModelError, match="no difference"):
         parity.check_chain(unit, expected)
 

@@ -40,15 +40,15 @@ def modsoft_export(monkeypatch, *arguments):
 
 
 @pytest.mark.parametrize(("robot", "history", "gain"), [("pneumatic-3", 10, 1.0), ("cable-4", 5, 3.0)])
-def test_full_size(tmp_path, make_checkpoint, robot, history, gain):
-    """Table S1's network, also with weights large enough to saturate it."""
+def test_network_of_table_s1_is_exported_within_the_bound(tmp_path, make_checkpoint, robot, history, gain):
+    """Also with weights large enough to saturate it."""
     checkpoint = make_checkpoint(tmp_path / "model.pt", robot, history, layers=4, hidden=128, gain=gain)
     exported = export(checkpoint)
     assert exported.path == tmp_path / "model.onnx"
     assert exported.path.stat().st_size < 5.6e6
     report = exported.report
-    assert list(report.fused) == list(report.chain) == [2, 3, 4, 5, 6, 7, 8, 16, 64]
-    assert max(report.fused.values()) <= report.bound
+    assert list(report.whole) == list(report.chain) == [2, 3, 4, 5, 6, 7, 8, 16, 64]
+    assert max(report.whole.values()) <= report.bound
     assert max(report.chain.values()) <= report.bound
     assert max(report.one_sweep_fewer.values()) > 10 * max(report.chain.values())
     network = checkpoints.network_of(checkpoints.load(checkpoint))
@@ -75,7 +75,7 @@ def test_description_is_complete(model):
     assert description.file_sha256 != "0" * 64
 
 
-def test_weights_hash_is_the_weights(tmp_path, make_checkpoint):
+def test_weights_hash_depends_on_the_weights_alone(tmp_path, make_checkpoint):
     one, other = (export(make_checkpoint(tmp_path / f"{seed}.pt", seed=seed)).description for seed in (1, 2))
     again = export(make_checkpoint(tmp_path / "again.pt", seed=1)).description
     assert one.weights_sha256 == again.weights_sha256 != other.weights_sha256
@@ -212,19 +212,19 @@ def test_meta_only_for_a_bare_state_dict(bare):
         export(meta.with_name("bare.pt"), meta=meta.with_name("none.toml"))
 
 
-def test_command(model, monkeypatch, capsys):
+def test_command_exports_and_inspects(model, monkeypatch, capsys):
     assert modsoft_export(monkeypatch, model) == 0
     shown = capsys.readouterr().out
     assert "model.onnx" in shown
     assert "64" in shown
     assert modsoft_export(monkeypatch, "--inspect", model.with_suffix(".onnx")) == 0
     shown = capsys.readouterr().out
-    for word in ("features [1, N, 10]", "h_from_base [2, 1, 8] default 0", "v_x[desired]", "period_s: 0.4", "eq. 1"):
-        assert word in shown
+    for text in ("features [1, N, 10]", "h_from_base [2, 1, 8] default 0", "v_x[desired]", "period_s: 0.4", "eq. 1"):
+        assert text in shown
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "word"),
+    ("arguments", "code", "message"),
     [
         (["nothing.pt"], 65, "no model file"),
         (["robot.toml"], 65, "not a checkpoint of modsoft-train"),
@@ -235,12 +235,12 @@ def test_command(model, monkeypatch, capsys):
         (["model.pt", "--out", "no/where.onnx"], 2, "no folder"),
     ],
 )
-def test_command_refuses_in_one_line(model, monkeypatch, capsys, arguments, code, word):
+def test_command_refuses_in_one_line(model, monkeypatch, capsys, arguments, code, message):
     monkeypatch.chdir(model.parent)
     Path("robot.toml").write_text("[robot]\n")
     assert modsoft_export(monkeypatch, *arguments) == code
     lines = capsys.readouterr().err.strip().splitlines()
-    assert word in lines[-1]
+    assert message in lines[-1]
     assert code == 2 or len(lines) == 1
 
 
