@@ -1,8 +1,8 @@
 """Mutants of Python source: every small wrong change of one file, as changes of its syntax tree.
 
 Changed are comparisons (with their boundaries), boolean and arithmetic operators, operands of `and` and `or`,
-negations and conditions, numbers (whole ones by one, others by a tenth), min and max, any and all, exceptions that are
-caught, returned values, and statements (left out). Texts, annotations, decorators and assertions stay.
+negations and conditions, numbers (integers by one, others by a tenth), min and max, any and all, caught exceptions,
+returned values, and statements (left out). Strings, annotations, decorators and assertions are not changed.
 """
 
 from __future__ import annotations
@@ -48,18 +48,19 @@ STATEMENTS = (ast.Expr, ast.Assign, ast.AugAssign, ast.AnnAssign, ast.Raise, ast
 
 @dataclass
 class Mutant:
-    """One change: `replacement` in the place of one node of `tree`."""
+    """One change: `replacement` instead of one node of `tree`."""
 
-    name: str  # as in the list of equivalents: it contains the line's text, because line numbers change
+    name: str  # the entry in the list of equivalents; it has the line's text, because line numbers change
     line: int
     tree: ast.Module = field(repr=False)
     parent: ast.AST = field(repr=False)
     field_name: str
-    index: int | None  # where the field is a list
+    index: int | None  # in the field, if that is a list
     replacement: ast.AST = field(repr=False)
 
     def compile(self, path: Path) -> CodeType:
-        """The code of the changed module. Changes the tree for good: call it in a process that ends afterwards."""
+        """The code of the changed module. It changes the tree that all mutants share: call it in a process that ends
+        afterwards."""
         if self.index is None:
             setattr(self.parent, self.field_name, self.replacement)
         else:
@@ -116,7 +117,7 @@ def _places(node: ast.AST, scope: str) -> Iterator[tuple[str, int, ast.AST, str,
 
 
 def _replacements(parent: ast.AST, field_name: str, node: ast.AST) -> Iterator[ast.AST]:
-    """What may be put in the place of one node."""
+    """The replacements of one node."""
     if field_name in ("test", "ifs") and not isinstance(node, (ast.Compare, ast.BoolOp, ast.UnaryOp)):
         yield ast.UnaryOp(ast.Not(), node)
     if isinstance(node, ast.Compare):
@@ -155,7 +156,7 @@ def _numbers(value: object) -> tuple[object, ...]:
 
 
 def _handlers(node: ast.ExceptHandler) -> Iterator[ast.AST]:
-    """Exceptions that are raised again, or of which one is not caught."""
+    """The handler raises the exception again, or does not catch one of its exceptions."""
     yield ast.ExceptHandler(node.type, node.name, [ast.Raise()])
     if isinstance(node.type, ast.Tuple):
         for left_out in range(len(node.type.elts)):
@@ -164,7 +165,7 @@ def _handlers(node: ast.ExceptHandler) -> Iterator[ast.AST]:
 
 
 def _statements(parent: ast.AST, node: ast.AST) -> Iterator[ast.AST]:
-    """A statement that is left out, or that returns nothing. Those of modules and classes are declarations."""
+    """The statement left out, or returning None. Those of modules and classes are declarations, which stay."""
     if isinstance(parent, (ast.Module, ast.ClassDef)):
         return
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):

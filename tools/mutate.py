@@ -88,8 +88,11 @@ class Mutant:
 
 
 def _without_comments(text: str) -> str:
-    """Replace comments by spaces, so that columns stay the same."""
-    blank = lambda match: re.sub(r"[^\n]", " ", match[0])  # noqa: E731
+    """Replace comments and strings by spaces, so that lines and columns stay the same."""
+
+    def blank(match: re.Match[str]) -> str:
+        return re.sub(r"[^\n]", " ", match[0])
+
     return re.sub(r"/\*.*?\*/|//[^\n]*|\"[^\"\n]*\"", blank, text, flags=re.DOTALL)
 
 
@@ -218,7 +221,7 @@ def _try_all(folder: Path, chosen: list[Mutant], listed: dict[str, str]) -> Muta
     os.environ["MODSOFT_NATIVE_FIRMWARE"] = str(folder / "built")
     mutation = Mutation(folder, chosen, listed)
     options = ["-q", "-s", "--disable-warnings", "--tb=native"]  # the shortest output, which is discarded
-    options += [word for plugin in ("cacheprovider", "timeout", "faulthandler") for word in ("-p", f"no:{plugin}")]
+    options += [f"-pno:{plugin}" for plugin in ("cacheprovider", "timeout", "faulthandler")]
     options += ["-k", "not corrupted_and_repeated and not arbitrary"]  # slow, and they detect no more than the others
     code = pytest.main([*options, *(str(ROOT / "tests" / "firmware" / name) for name in TESTS)], plugins=[mutation])
     if code != 0:

@@ -241,9 +241,9 @@ def score(rows: dict[int, list[Line]]) -> str:
     missing = [row for row in ROWS if not rows.get(row)]
     unmet = [row for row in ROWS if rows.get(row) and not met(rows[row])]
     text = f"{len(ROWS) - len(missing) - len(unmet)} of {len(ROWS)} rows are met."
-    for word, which in (("Not met", unmet), ("Missing", missing)):
-        if which:
-            text += f" {word}: {', '.join(map(str, which))}."
+    for label, numbers in (("Not met", unmet), ("Missing", missing)):
+        if numbers:
+            text += f" {label}: {', '.join(map(str, numbers))}."
     return text
 
 

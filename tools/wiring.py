@@ -25,14 +25,14 @@ def channel_table(source: str) -> list[tuple[int, int]]:
 
 def sensor_mask(source: str) -> int:
     """SENSORS of pins.h: bit c is set where channel c has a pressure sensor on A<c>."""
-    found = re.search(r"^#define SENSORS (0x[0-9a-fA-F]+)", source, re.MULTILINE)
-    if found is None:
+    definition = re.search(r"^#define SENSORS (0x[0-9a-fA-F]+)", source, re.MULTILINE)
+    if definition is None:
         raise SystemExit("firmware/pins.h: no line '#define SENSORS 0x...'; the picture cannot be drawn")
-    return int(found[1], 16)
+    return int(definition[1], 16)
 
 
-def _text(x: float, y: float, words: str, anchor: str = "middle", size: int = 13) -> str:
-    return f'<text x="{x}" y="{y}" text-anchor="{anchor}" font-size="{size}">{words}</text>'
+def _text(x: float, y: float, text: str, anchor: str = "middle", size: int = 13) -> str:
+    return f'<text x="{x}" y="{y}" text-anchor="{anchor}" font-size="{size}">{text}</text>'
 
 
 def _wire(*points: tuple[float, float]) -> str:

@@ -21,7 +21,7 @@ def test_builds_for_the_mega_and_is_small():
     assert "warning" not in done.stderr
     elf = FIRMWARE.parent / "build" / "firmware" / "modsoft.elf"
     size = subprocess.run(["avr-size", str(elf)], capture_output=True, text=True, check=True).stdout.split()
-    text, data, bss = (int(word) for word in size[6:9])
+    text, data, bss = map(int, size[6:9])
     assert text + data < 16_000
     assert data + bss < 2_000  # of 8 KiB; the rest is for the stack
 
