@@ -1,8 +1,8 @@
-"""Mutation test of the runtime's safety part: small wrong changes, each of which its unit tests have to notice.
+"""Mutation test of the runtime's safety part: small wrong changes, each of which its unit tests must detect.
 
-The changes are those of tools/mutants_python.py, one at a time. A mutant that no test notices survives: exit code 1. A
-change that makes no difference is listed with its reason in tools/mutate_runtime_equivalent.txt; one listed there that
-a test does notice, or that does not exist, is an error too.
+The changes are those of tools/mutants_python.py, one at a time. A mutant that no test detects survives: exit code 1.
+Changes without any effect are listed in tools/mutate_runtime_equivalent.txt, each with its reason; an entry that a test
+detects, or that no longer exists, is an error too.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from mutate import equivalents
 
 ROOT = Path(__file__).resolve().parent.parent
 EQUIVALENT = Path(__file__).with_name("mutate_runtime_equivalent.txt")
-# The tests of NAME.py are in tests/runtime/test_NAME*.py; those of discovery with its connection.
+# The tests of NAME.py are tests/runtime/test_NAME*.py; discovery is tested with the connection.
 SOURCES = ("safety.py", "stop.py", "board/connection.py", "board/discovery.py", "control/controller.py", "loop.py")
 TESTS = {"board/discovery.py": "connection"}
 HANGS_AFTER_S = 20  # a run of one file's tests takes about 1
-MEMORY = 4 << 30  # bytes; an endless loop fills more
+MEMORY = 4 << 30  # bytes; an endless loop may fill more
 PLUGINS = ("cacheprovider", "timeout", "faulthandler", "xdist", "threadexception", "unraisableexception", "anyio")
 OPTIONS = ["-x", "-q", "--tb=no", "--disable-warnings", "--hypothesis-profile=mutation"]
 OPTIONS += [option for plugin in PLUGINS for option in ("-p", f"no:{plugin}")]
@@ -57,7 +57,7 @@ class MutatedModule(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 class FirstFailure:
-    """A pytest plugin that runs the tests of `first` before the others, and keeps the test that fails."""
+    """A pytest plugin that runs the tests of `first` before the others, and keeps the first one that fails."""
 
     def __init__(self, first: Sequence[str] = ()) -> None:
         self.first = first
@@ -79,7 +79,8 @@ def _run_tests(source: str, plugin: FirstFailure, *options: str) -> int:
 
 
 def _prepare(sources: Sequence[str]) -> None:
-    """Import what the tests import, so that no fork has to, and forget this project's own modules."""
+    """Import what the tests import, so that no fork has to; then remove this project's modules, so that each fork
+    imports them again, one of them mutated."""
     settings.register_profile(
         "mutation", derandomize=True, database=None, deadline=None, phases=(Phase.explicit, Phase.generate)
     )
@@ -87,15 +88,13 @@ def _prepare(sources: Sequence[str]) -> None:
         _run_tests(source, FirstFailure(), "--collect-only")
     folders = tuple(str(ROOT / folder) + os.sep for folder in ("runtime", "training", "export", "tools/hil", "tests"))
     for name, module in list(sys.modules.items()):
-        if str(getattr(module, "__file__", None)).startswith(folders):
-            del sys.modules[name]
-        elif name.split(".")[0] == "modsoft":
+        if name.split(".")[0] == "modsoft" or str(getattr(module, "__file__", None)).startswith(folders):
             del sys.modules[name]
 
 
-def noticed_by(source: str, mutant: Mutant | None, first: Sequence[str] = ()) -> str | None:
-    """The first test that fails with this mutant, in a process of its own; "" where the process dies, hangs or cannot
-    import it; None where none fails."""
+def detected_by(source: str, mutant: Mutant | None, first: Sequence[str] = ()) -> str | None:
+    """The first test that fails with this mutant, in a process of its own; "" if the process dies, hangs or cannot
+    import the mutant; None if no test fails."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -113,33 +112,33 @@ def noticed_by(source: str, mutant: Mutant | None, first: Sequence[str] = ()) ->
         finally:
             os._exit(code)
     os.close(writing)
-    with os.fdopen(reading) as answers:
-        answer = answers.read()
+    with os.fdopen(reading) as pipe:
+        failed = pipe.read()
     _, status = os.waitpid(child, 0)
-    return answer if status else None
+    return failed if status else None
 
 
 _tried: list[tuple[str, Mutant]] = []  # inherited by the worker processes
-_recent: list[str] = []  # the tests that noticed the last mutants are tried first
+_recent: list[str] = []  # the tests that detected the last mutants, which run first
 
 
 def _try_one(number: int) -> tuple[int, str | None]:
-    noticed = noticed_by(*_tried[number], _recent)
-    if noticed:
-        if noticed in _recent:
-            _recent.remove(noticed)
-        _recent.insert(0, noticed)
-    return number, noticed
+    test = detected_by(*_tried[number], _recent)
+    if test:
+        if test in _recent:
+            _recent.remove(test)
+        _recent.insert(0, test)
+    return number, test
 
 
 def _try_all(tried: list[tuple[str, Mutant]], jobs: int) -> dict[int, str | None]:
-    """Number of each mutant to the test that noticed it."""
+    """Number of each mutant to the test that detects it."""
     _tried[:] = tried
     results = {}
     started = time.monotonic()
     with multiprocessing.get_context("fork").Pool(jobs) as pool:
-        for number, noticed in pool.imap_unordered(_try_one, range(len(tried))):
-            results[number] = noticed
+        for number, test in pool.imap_unordered(_try_one, range(len(tried))):
+            results[number] = test
             if sys.stderr.isatty() or len(results) % 50 == 0:
                 print(f"\r{len(results)}/{len(tried)} {time.monotonic() - started:.0f} s ", end="", file=sys.stderr)
     return results
@@ -147,16 +146,16 @@ def _try_all(tried: list[tuple[str, Mutant]], jobs: int) -> dict[int, str | None
 
 @click.command(help=__doc__)
 @click.option("--every", default=1, show_default=True, help="Try only every n-th mutant.")
-@click.option("--source", type=click.Choice(SOURCES), multiple=True, help="Of this file alone; repeatable.")
-@click.option("--jobs", default=os.cpu_count(), show_default=True, help="Mutants tried at the same time.")
-@click.option("--list", "only_list", is_flag=True, help="Print the mutants, try none.")
+@click.option("--source", type=click.Choice(SOURCES), multiple=True, help="Only mutants of this file; repeatable.")
+@click.option("--jobs", default=os.cpu_count(), show_default=True, help="Mutants tried in parallel.")
+@click.option("--list", "only_list", is_flag=True, help="Print the mutants and exit.")
 def main(every: int, source: tuple[str, ...], jobs: int, only_list: bool) -> None:
     """Try the mutants and report which survive."""
     sources = source or SOURCES
     every_mutant = [(name, mutant) for name in SOURCES for mutant in mutants(ROOT / "runtime" / name, name)]
     listed = equivalents(EQUIVALENT)
     if stale := sorted(set(listed) - {mutant.name for _, mutant in every_mutant}):
-        sys.exit(f"mutate: {EQUIVALENT.name} lists what does not exist: {stale[0]}")
+        sys.exit(f"mutate: {EQUIVALENT.name} has an entry without a mutant; correct or delete it: {stale[0]}")
     tried = [(name, mutant) for name, mutant in every_mutant if name in sources][::every]
     if only_list:
         print("\n".join(mutant.name for _, mutant in tried))
@@ -164,23 +163,23 @@ def main(every: int, source: tuple[str, ...], jobs: int, only_list: bool) -> Non
     started = time.monotonic()
     _prepare(sources)
     for name in sources:
-        if (failed := noticed_by(name, None)) is not None:
+        if (failed := detected_by(name, None)) is not None:
             sys.exit(f"mutate: the tests of {name} fail without a mutant: {failed or 'no test ran'}")
     results = _try_all(tried, jobs)
-    survivors, needless, equivalent = [], [], 0
+    survivors, detected_though_listed, equivalent = [], [], 0
     for number, (name, mutant) in enumerate(tried):
         if results[number] is None and mutant.name not in listed:
             survivors.append(f"survives: runtime/{name}:{mutant.line}: {mutant.name}")
         elif mutant.name in listed:
             equivalent += 1
             if results[number] is not None:
-                needless.append(f"listed as equivalent, but a test notices it: {mutant.name}")
-    print("\n".join(["", *survivors, *needless]))
+                detected_though_listed.append(f"listed as equivalent, but a test detects it: {mutant.name}")
+    print("\n".join(["", *survivors, *detected_though_listed]))
     print(
         f"{len(tried)} mutants in {time.monotonic() - started:.0f} s: {len(tried) - equivalent - len(survivors)} "
-        f"noticed, {equivalent} equivalent, {len(survivors)} survive"
+        f"detected, {equivalent} equivalent, {len(survivors)} survive"
     )
-    sys.exit(1 if survivors or needless else 0)
+    sys.exit(1 if survivors or detected_though_listed else 0)
 
 
 if __name__ == "__main__":

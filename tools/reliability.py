@@ -237,7 +237,7 @@ def table(rows: dict[int, list[Line]]) -> str:
 
 
 def score(rows: dict[int, list[Line]]) -> str:
-    """One sentence: the number of rows met, and the rows that are not."""
+    """The number of rows met, and the rows that are not met or missing."""
     missing = [row for row in ROWS if not rows.get(row)]
     unmet = [row for row in ROWS if rows.get(row) and not met(rows[row])]
     text = f"{len(ROWS) - len(missing) - len(unmet)} of {len(ROWS)} rows are met."

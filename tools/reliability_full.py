@@ -208,9 +208,12 @@ def run_tests(
             process.stop()
 
 
-def run(root: Path, folder: Path | None, rows: set[int], say: Callable[[str], None]) -> tuple[list[Result], int, str]:
+def run(
+    root: Path, folder: Path | None, rows: set[int], report: Callable[[str], None]
+) -> tuple[list[Result], int, str]:
     """Runs the tests of these rows that have not finished. Returns all results in the folder, the number of tests of
-    the matrix without one, and the commit. folder: None is one in build/ for this commit."""
+    the matrix without one, and the commit. folder: None is one in build/ for this commit. report: takes one line of
+    progress."""
     commit = commit_of(root)
     folder = folder or root / "build" / f"reliability-{commit[:12]}"
     work = Work(folder, commit)
@@ -223,13 +226,13 @@ def run(root: Path, folder: Path | None, rows: set[int], say: Callable[[str], No
         if result.exit_code in FINISHED_CODES:
             work.keep(result)
         outcome = {0: "passed", 1: "failed"}.get(result.exit_code, f"no result, pytest ended with {result.exit_code}")
-        say(f"{result.seconds:8.1f} s  {outcome}  {result.test.node}")
+        report(f"{result.seconds:8.1f} s  {outcome}  {result.test.node}")
 
     with locked(folder / "lock", folder, "reliability"):
         tests = collect(root)
         chosen = [test for test in tests if test.rows & rows]
         left = [test for test in chosen if work.result(test) is None]
-        say(f"{len(chosen) - len(left)} of {len(chosen)} tests have finished; results in {folder}")
+        report(f"{len(chosen) - len(left)} of {len(chosen)} tests have finished; results in {folder}")
         for realtime, workers in ((False, min(2, os.cpu_count() or 1)), (True, 1)):
             run_tests([test for test in left if test.realtime is realtime], root, workers, finished, check)
     results = [result for test in tests if (result := work.result(test)) is not None]
