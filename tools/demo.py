@@ -30,26 +30,26 @@ DATA, CHECKPOINT, MODEL, REPORT = (FOLDER / name for name in ("dataset.h5", "mod
 
 @dataclass(frozen=True)
 class Stage:
-    """A command, the file that it makes, the files that it reads, and the module that makes the result."""
+    """A command, the file that it writes, the files that it reads, and the module that computes the result."""
 
     title: str
     command: list[str]
-    makes: Path
-    reads: list[Path]
+    output: Path
+    inputs: list[Path]
     module: str
 
     def digest(self) -> str:
         """Changes with the command, the files that it reads, and the code that shapes the result."""
-        return made_from.digest(self.command, self.reads, [self.module])
+        return made_from.digest(self.command, self.inputs, [self.module])
 
     @property
     def results(self) -> list[Path]:
-        """What the command leaves, finished or interrupted."""
-        return [self.makes, *(self.makes.with_name(self.makes.name + suffix) for suffix in (".parts", ".resume"))]
+        """The output, and the files that an interrupted command leaves for its resumption."""
+        return [self.output, *(self.output.with_name(self.output.name + suffix) for suffix in (".parts", ".resume"))]
 
     @property
     def digest_file(self) -> Path:
-        return self.makes.with_name(f".{self.makes.name}.made-from")
+        return self.output.with_name(f".{self.output.name}.made-from")
 
 
 STAGES = [
@@ -90,25 +90,25 @@ def run(command: list[str]) -> int:
         raise
 
 
-def make(stage: Stage, number: str) -> int:
+def make(stage: Stage, label: str) -> int:
     """Runs a stage unless its result is up to date; returns its exit code."""
     digest = stage.digest()
     before = stage.digest_file.read_text() if stage.digest_file.is_file() else ""
-    if stage.makes.is_file() and before == digest:
-        print(f"{number} {stage.title}: {stage.makes} is up to date", flush=True)
+    if stage.output.is_file() and before == digest:
+        print(f"{label} {stage.title}: {stage.output} is up to date", flush=True)
         return 0
-    print(f"{number} {stage.title}", flush=True)
+    print(f"{label} {stage.title}", flush=True)
     existing = [path for path in stage.results if path.exists()]
     if existing and not before:
         print(f"demo: {existing[0]}: not made by the demo; move it elsewhere", file=sys.stderr)
         return 2
-    if before != digest:  # the existing files, finished or not, were made from something else
+    if before != digest:  # the existing files are of another command, other inputs or other code
         for old in existing:
             shutil.rmtree(old) if old.is_dir() else old.unlink()
     stage.digest_file.write_text(digest)  # first, so that an interrupted stage is resumed
     started_s = time.monotonic()
     code = run(stage.command)
-    if code == TargetNotReached.exit_code:  # so the next demo starts this stage from the beginning
+    if code == TargetNotReached.exit_code:  # the next demo starts this stage from the beginning
         stage.digest_file.write_text("missed its target\n")
     print(f"    {time.monotonic() - started_s:.0f} s", flush=True)
     return code

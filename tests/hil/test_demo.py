@@ -130,10 +130,10 @@ def test_training_that_missed_its_target_stops_the_demo_and_starts_again(demo):
 
 def test_each_stage_reads_the_result_of_the_one_before(demo):
     for before, after in itertools.pairwise(demo.STAGES):
-        assert before.makes in after.reads
-        assert str(before.makes) in after.command
-    assert str(demo.STAGES[-1].makes) in demo.RUN
-    for path in [path for each in demo.STAGES for path in each.reads]:
+        assert before.output in after.inputs
+        assert str(before.output) in after.command
+    assert str(demo.STAGES[-1].output) in demo.RUN
+    for path in [path for each in demo.STAGES for path in each.inputs]:
         assert path.parent == demo.FOLDER or (ROOT / path).is_file(), path
 
 
