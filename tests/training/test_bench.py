@@ -1,4 +1,4 @@
-"""tools/bench/training.py: a race of a tiny network, and its report."""
+"""tools/bench/training.py: a comparison with a tiny network, and its report."""
 
 import math
 
@@ -30,22 +30,24 @@ def data(tmp_path_factory):
 
 
 def test_all_methods_train_on_the_same_samples_until_the_target(bench, data):
-    race = bench.Race(str(data), 300, 1, 16, iterations=40, batch=32, target_percent=40.0, seed=0, authors_check=20)
-    result = bench.raced(race, minutes=4.0, turn_s=0.5)
-    ways = result["ways"]
-    assert [ways[way]["batch"] for way in bench.WAYS] == [32, 32, 64]
-    for way in ways.values():
-        assert way["best_percent"] <= 40.0  # an untrained network has 25
-        assert way["seconds_to_target"] == way["seconds"] > 0
-        assert way["samples_per_s"] == pytest.approx(way["batch"] * way["iterations_per_s"])
-    assert ways["authors"]["iterations"] == 20  # its first validation
-    expected = ways["authors"]["seconds"] / ways["ours"]["seconds"]
+    comparison = bench.Comparison(
+        str(data), 300, 1, 16, iterations=40, batch=32, target_percent=40.0, seed=0, authors_check=20
+    )
+    result = bench.run(comparison, minutes=4.0, turn_s=0.5)
+    methods = result["methods"]
+    assert [methods[method]["batch"] for method in bench.METHODS] == [32, 32, 64]
+    for method in methods.values():
+        assert method["best_percent"] <= 40.0  # an untrained network has 25
+        assert method["seconds_to_target"] == method["seconds"] > 0
+        assert method["samples_per_s"] == pytest.approx(method["batch"] * method["iterations_per_s"])
+    assert methods["authors"]["iterations"] == 20  # its first validation
+    expected = methods["authors"]["seconds"] / methods["ours"]["seconds"]
     assert result["ratios"]["authors"]["time_to_target"] == pytest.approx(expected)
     assert not result["ratios"]["authors"]["lower_bound"]
 
 
 def states(*percents, batch=64):
-    """Reports of a way that validates every 100 iterations, after two seconds each."""
+    """Reports of a method that validates every 100 iterations, after two seconds each."""
     return [
         {"iteration": 1 + 100 * i, "percent": percent, "batch": batch, "cpu_s": 7.0 + 2.0 * i}
         for i, percent in enumerate(percents)
@@ -65,16 +67,16 @@ def test_time_counts_from_the_first_iteration_to_the_first_validation_at_the_tar
 
 
 def test_missed_target_is_reported_with_a_lower_bound(bench, tmp_path):
-    race = bench.Race("d.h5", 300, layers=1, hidden=4, iterations=60, batch=64, target_percent=2.0, seed=0)
+    comparison = bench.Comparison("d.h5", 300, layers=1, hidden=4, iterations=60, batch=64, target_percent=2.0, seed=0)
     reached = bench.figures(states(math.inf, 1.5), 2.0)
     missed = bench.figures(states(math.inf, 8.0, 6.0, 5.0), 2.0)
     not_validated = bench.figures(states(math.inf, math.inf), 2.0)
     common = {"about": bench.report.about(isa="avx2", torch="2"), "steps": bench.step_times_at("avx2", 1)}
-    slower = common | bench.compared(race, {"ours": reached, "adam": reached, "authors": missed})
+    slower = common | bench.compared(comparison, {"ours": reached, "adam": reached, "authors": missed})
     assert (slower["ratios"]["authors"]["time_to_target"], slower["ratios"]["authors"]["lower_bound"]) == (3.0, True)
     assert "| not reached | at least 3.0 |" in bench.section(slower)
     assert "| 2 | 1.0 |" in bench.section(slower)
-    without = common | bench.compared(race, {"ours": not_validated, "adam": reached, "authors": missed})
+    without = common | bench.compared(comparison, {"ours": not_validated, "adam": reached, "authors": missed})
     assert without["ratios"]["authors"]["time_to_target"] is None
     assert bench.section(without).count("not reached") == 2
     page = tmp_path / "page.md"
@@ -90,7 +92,9 @@ def test_step_time_is_split_into_gradient_and_optimizer(bench):
     rows = bench.step_times_at("avx2", 1)
     assert [(row["batch"], row["modules"]) for row in rows] == [(128, 3), (256, 4)]
     for row in rows:
-        assert row["share"] == pytest.approx(row["optimizer_ms"] / (row["gradient_ms"] + row["optimizer_ms"]))
+        assert row["optimizer_fraction"] == pytest.approx(
+            row["optimizer_ms"] / (row["gradient_ms"] + row["optimizer_ms"])
+        )
 
 
 @pytest.mark.parametrize("name", ["collect", "latency", "loop", "models", "simulation", "training"])

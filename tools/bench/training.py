@@ -1,15 +1,16 @@
 """Training speed: the time to the error of the paper's Table 1, compared with Adam and with the authors' training.
 
-`python tools/bench/training.py --isa native|avx2 --report docs/training.md`. Three processes take turns of a few
-seconds on one core, so that other load of the machine affects all alike. They have the same samples, split (the
-paper's, shuffled) and network, and one torch thread each:
+`python tools/bench/training.py --isa native|avx2 --report docs/training.md`. Three methods, each in its own process,
+take turns of a few seconds on one core, so that other load of the machine affects all alike. They have the same
+samples, split (the paper's, shuffled) and network, and one torch thread each:
 
     ours     modsoft.training.train.train with its own defaults, --iterations of --batch windows
     adam     the same with Adam for all parameters instead of Muon, and four times the iterations, which it needs
-    authors  a Python data set of windows read through a DataLoader with one worker; Table S1: batch 64, Adam at a
-             constant learning rate of 0.001; dropout 0.1; validation every 500 iterations
+    authors  the training of the paper's authors: windows read one by one through a DataLoader with one worker; batch
+             64, Adam at a constant learning rate of 0.001 (Table S1); dropout 0.1; validation every 500 iterations
 
-A way ends when its validation error, mean over the modules, is at most Table 1's, or after --give-up times our time.
+A method ends when its validation error, mean over the modules, is at most that of Table 1, or after --give-up times our
+time.
 Times are processor time of the training process, validation included. The authors' worker runs on the other core and
 is not counted. The fraction of the optimizer in a training step is measured first.
 """
@@ -30,7 +31,7 @@ import click
 import numpy as np
 import report
 import torch
-from training_ways import WAYS, Race
+from training_methods import METHODS, Comparison
 
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.entry_point import entry
@@ -38,7 +39,7 @@ from modsoft.study.cells import table
 from modsoft.study.paper import TABLE_1
 from modsoft.training.data import collect
 
-SCRIPT = Path(__file__).with_name("training_ways.py")
+SCRIPT = Path(__file__).with_name("training_methods.py")
 SAMPLES, STEPS_PER_EPISODE = 16_000, 1000  # the paper's
 TURN_S = 5.0
 # Limits of the instruction set of torch and of the libraries that it calls.
@@ -47,28 +48,28 @@ ISAS = {
     "avx2": {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"},
 }
 
-States = list[dict[str, Any]]  # what a way reported, see `training_ways.Turns`
+States = list[dict[str, Any]]  # what a method reported, see `training_methods.Turns`
 
 
-def command(way: str, argument: str) -> list[str]:
-    return [sys.executable, str(SCRIPT), way, argument]
+def command(method: str, argument: str) -> list[str]:
+    return [sys.executable, str(SCRIPT), method, argument]
 
 
 def step_times_at(isa: str, rounds: int) -> list[dict[str, Any]]:
-    """`training_ways.step_times` in a process limited to the instruction set."""
+    """`training_methods.step_times` in a process limited to the instruction set."""
     environment = report.script_environment(**ISAS[isa])
     done = subprocess.run(command("steps", str(rounds)), env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout)
 
 
 class Runner:
-    """One way in its own process, which trains in its turns only."""
+    """One method in its own process, which trains in its turns only."""
 
-    def __init__(self, way: str, race: Race, isa: str):
-        self.target_percent = race.target_percent
+    def __init__(self, method: str, comparison: Comparison, isa: str):
+        self.target_percent = comparison.target_percent
         self.states: States = []
         self.process = subprocess.Popen(
-            command(way, json.dumps(dataclasses.asdict(race))),
+            command(method, json.dumps(dataclasses.asdict(comparison))),
             env=report.script_environment(**ISAS[isa]),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -76,10 +77,10 @@ class Runner:
         )
         self._read_states()  # until the first iteration: imports and reading of data do not count
         if not self.states:
-            raise click.ClickException(f"{way}: ended before its first iteration; see its output above")
+            raise click.ClickException(f"{method}: ended before its first iteration; see its output above")
 
     def turn(self, seconds: float) -> None:
-        """Lets the process train for so long."""
+        """The process trains for so many seconds."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{seconds}\n")
         self.process.stdin.flush()
@@ -99,7 +100,7 @@ class Runner:
         self.process.wait()
 
     def over(self, limit_s: float) -> bool:
-        """Whether the way has reached the target, has ended, or has trained for `limit_s`."""
+        """Whether the method has reached the target, has ended, or has trained for `limit_s`."""
         trained_s = self.states[-1]["cpu_s"] - self.states[0]["cpu_s"]
         reached = first_at_target(self.states, self.target_percent) is not None
         return reached or trained_s > limit_s or self.process.poll() is not None
@@ -111,7 +112,7 @@ def first_at_target(states: States, target_percent: float) -> dict[str, Any] | N
 
 
 def figures(states: States, target_percent: float) -> dict[str, Any]:
-    """The figures of one way; the time to the target is None if it was not reached."""
+    """The figures of one method; the time to the target is None if it was not reached."""
     first, at_target = states[0], first_at_target(states, target_percent)
     last = at_target or states[-1]
     seconds = last["cpu_s"] - first["cpu_s"]
@@ -128,43 +129,44 @@ def figures(states: States, target_percent: float) -> dict[str, Any]:
     }
 
 
-def compared(race: Race, ways: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The figures of every way and the ratios of ours to the others: more than 1 means that ours is faster."""
-    reached_s = ways["ours"]["seconds_to_target"]
+def compared(comparison: Comparison, methods: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The figures of every method and the ratios of ours to the others: more than 1 means that ours is faster."""
+    reached_s = methods["ours"]["seconds_to_target"]
     ratios = {}
-    for way in list(WAYS)[1:]:
-        other = ways[way]
-        # If the other way has not reached the target, its time so far is a lower bound.
-        ratios[way] = {
-            "samples_per_s": ways["ours"]["samples_per_s"] / other["samples_per_s"],
+    for method in list(METHODS)[1:]:
+        other = methods[method]
+        # If the other method has not reached the target, its time so far is a lower bound.
+        ratios[method] = {
+            "samples_per_s": methods["ours"]["samples_per_s"] / other["samples_per_s"],
             "time_to_target": other["seconds"] / reached_s if reached_s else None,
             "lower_bound": other["seconds_to_target"] is None,
         }
-    settings = {name: value for name, value in dataclasses.asdict(race).items() if name != "data"}
-    return {"race": settings, "ways": ways, "ratios": ratios}
+    settings = {name: value for name, value in dataclasses.asdict(comparison).items() if name != "data"}
+    return {"comparison": settings, "methods": methods, "ratios": ratios}
 
 
-def raced(race: Race, minutes: float, turn_s: float, isa: str = "native") -> dict[str, Any]:
-    """All ways in turns, until each is over or for so many minutes of wall clock."""
+def run(comparison: Comparison, minutes: float, turn_s: float, isa: str = "native") -> dict[str, Any]:
+    """All methods in turns, until each is over or for so many minutes of wall clock."""
     with contextlib.ExitStack() as stack:
         runners = {}
-        for way in WAYS:
-            runners[way] = Runner(way, race, isa)
-            stack.callback(runners[way].end)
+        for method in METHODS:
+            runners[method] = Runner(method, comparison, isa)
+            stack.callback(runners[method].end)
         end_s, limit_s = time.monotonic() + 60.0 * minutes, float("inf")
         while time.monotonic() < end_s and not all(runner.over(limit_s) for runner in runners.values()):
-            for way, runner in runners.items():
+            for method, runner in runners.items():
                 if not runner.over(limit_s):
                     runner.turn(turn_s)
                     state = runner.states[-1]
-                    click.echo(f"{way}: iteration {state['iteration']}, best {state['percent']:.2f} %", err=True)
-            ours_s = figures(runners["ours"].states, race.target_percent)["seconds_to_target"]
-            limit_s = race.give_up * ours_s if ours_s else limit_s
-        without_turn = [way for way, runner in runners.items() if len(runner.states) < 2]
+                    click.echo(f"{method}: iteration {state['iteration']}, best {state['percent']:.2f} %", err=True)
+            ours_s = figures(runners["ours"].states, comparison.target_percent)["seconds_to_target"]
+            limit_s = comparison.give_up * ours_s if ours_s else limit_s
+        without_turn = [method for method, runner in runners.items() if len(runner.states) < 2]
         if without_turn:
             names = ", ".join(without_turn)
             raise click.ClickException(f"{names}: no turn within {minutes:g} minutes; give more --minutes")
-        return compared(race, {way: figures(runners[way].states, race.target_percent) for way in WAYS})
+        target_percent = comparison.target_percent
+        return compared(comparison, {name: figures(each.states, target_percent) for name, each in runners.items()})
 
 
 def processor() -> str:
@@ -176,37 +178,37 @@ def processor() -> str:
 
 def section(result: report.Result) -> str:
     """One result in Markdown."""
-    race, about = result["race"], result["about"]
+    comparison, about = result["comparison"], result["about"]
     lines = [
         f"Instruction set {about['isa']}: {about['processor']}, {about['cores']} cores, torch {about['torch']}, commit "
-        f"{about['commit']}; {race['samples']} samples.",
+        f"{about['commit']}; {comparison['samples']} samples.",
         "",
     ]
     heads = [
-        "way",
+        "method",
         "batch",
         "iterations/s",
         "samples/s",
         "iterations",
         "best %",
-        f"s to {race['target_percent']:.2f} %",
+        f"s to {comparison['target_percent']:.2f} %",
     ]
     rows = []
-    for way, row in result["ways"].items():
-        ratio, reached_s = result["ratios"].get(way), row["seconds_to_target"]
+    for method, row in result["methods"].items():
+        ratio, reached_s = result["ratios"].get(method), row["seconds_to_target"]
         faster = ""
         if ratio and ratio["time_to_target"]:
             faster = f"{'at least ' * ratio['lower_bound']}{ratio['time_to_target']:.1f}"
         speeds = [f"{row['iterations_per_s']:.1f}", f"{row['samples_per_s']:.0f}"]
         best = "none yet" if row["best_percent"] is None else f"{row['best_percent']:.2f}"
         reached = f"{reached_s:.0f}" if reached_s else "not reached"
-        rows.append([way, row["batch"], *speeds, row["iterations"], best, reached, faster])
+        rows.append([method, row["batch"], *speeds, row["iterations"], best, reached, faster])
     lines += table([*heads, "ours is faster by"], rows)
     heads = ["windows in a step", "modules", "gradient, ms", "optimizer, ms", "fraction of the optimizer", "target"]
     rows = []
     for row in result["steps"]:
-        times = [f"{row['gradient_ms']:.1f}", f"{row['optimizer_ms']:.1f}", f"{row['share']:.0%}"]
-        rows.append([row["batch"], row["modules"], *times, f"at most {row['target_share']:.0%}"])
+        times = [f"{row['gradient_ms']:.1f}", f"{row['optimizer_ms']:.1f}", f"{row['optimizer_fraction']:.0%}"]
+        rows.append([row["batch"], row["modules"], *times, f"at most {row['target_fraction']:.0%}"])
     return "\n".join([*lines, *table(heads, rows)]).rstrip()
 
 
@@ -217,8 +219,10 @@ def section(result: report.Result) -> str:
 @click.option("--data", type=click.Path(path_type=Path), help="Data set to train on.  [default: collect one]")
 @click.option("--iterations", default=1400, show_default=True, help="Of ours: few that still reach the target.")
 @click.option("--batch", default=128, show_default=True, help="Windows in an iteration of ours.")
-@click.option("--give-up", default=5.0, show_default=True, help="Stop a way after so many times our time.")
-@click.option("--minutes", default=90.0, show_default=True, help="Limit of the wall-clock time of all ways together.")
+@click.option("--give-up", default=5.0, show_default=True, help="Stop a method after so many times our time.")
+@click.option(
+    "--minutes", default=90.0, show_default=True, help="Limit of the wall-clock time of all methods together."
+)
 @click.option("--seed", default=0, show_default=True)
 def main(
     isa: str,
@@ -227,7 +231,7 @@ def main(
     quick: bool,
     data: Path | None,
     minutes: float,
-    **race_options: Any,
+    **comparison_options: Any,
 ) -> None:
     about = report.about(isa=isa, torch=str(torch.__version__)) | {"processor": processor()}
     with tempfile.TemporaryDirectory() as folder:
@@ -236,12 +240,13 @@ def main(
             data = Path(folder) / "d.h5"
             collect.collect(robot_file.load("cable-4"), data, samples, steps=200 if quick else STEPS_PER_EPISODE)
         target_percent = float(np.mean(TABLE_1["bilstm"][0]))
-        race = Race(str(data), samples, layers=4, hidden=128, target_percent=target_percent, **race_options)
+        sizes = {"layers": 4, "hidden": 128}
+        comparison = Comparison(str(data), samples, **sizes, target_percent=target_percent, **comparison_options)
         if quick:
-            race = dataclasses.replace(race, layers=2, hidden=32, iterations=300, target_percent=8.0)
+            comparison = dataclasses.replace(comparison, layers=2, hidden=32, iterations=300, target_percent=8.0)
             minutes = min(minutes, 0.7)
         steps = step_times_at(isa, 3 if quick else 30)
-        result = {"about": about, **raced(race, minutes, turn_s, isa), "steps": steps}
+        result = {"about": about, **run(comparison, minutes, turn_s, isa), "steps": steps}
     report.publish(result, section, json_file, page, isa)
 
 

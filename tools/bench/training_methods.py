@@ -1,7 +1,8 @@
-"""The trainings that tools/bench/training.py compares, and the time of a training step, each in its own process.
+"""The training methods that tools/bench/training.py compares, and the time of a training step, each in its own process.
 
-`python tools/bench/training_ways.py WAY RACE` trains in turns, as its standard input grants them, and reports its
-progress as lines of JSON; `steps ROUNDS` measures training steps.
+`python tools/bench/training_methods.py METHOD COMPARISON` trains in turns and reports its progress on standard output:
+one line of JSON for each state. A line on standard input is the duration of the next turn in seconds.
+`training_methods.py steps ROUNDS` measures training steps.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ STEPS = ((128, "pneumatic-3", 0.5), (256, "cable-4", 0.25))
 
 
 @dataclasses.dataclass(frozen=True)
-class Race:
-    """What all ways train, and when they have reached the target."""
+class Comparison:
+    """What all methods train, and their target."""
 
     data: str  # file
     samples: int
@@ -48,7 +49,7 @@ class Race:
     target_percent: float  # validation error, mean over the modules
     seed: int
     authors_check: int = 500  # iterations between two validations of the authors' training
-    give_up: float = 5.0  # times our time, after which a way is stopped
+    give_up: float = 5.0  # times our time, after which a method is stopped
 
 
 def first_samples(data: DataSet, samples: int) -> DataSet:
@@ -58,7 +59,7 @@ def first_samples(data: DataSet, samples: int) -> DataSet:
 
 
 class Turns:
-    """Reports the progress of a training on standard output, and waits for the next turn on standard input."""
+    """Trains in turns: reports the progress on standard output, and waits for the next turn on standard input."""
 
     def __init__(self, batch: int):
         self.batch = batch
@@ -72,7 +73,7 @@ class Turns:
             print(json.dumps(state | {"cpu_s": time.process_time()}), flush=True)
         if waits:
             turn_s = sys.stdin.readline()
-            if not turn_s:  # the race is over
+            if not turn_s:  # closed: the comparison has ended
                 raise SystemExit
             self.end_s = time.monotonic() + float(turn_s)
 
@@ -89,14 +90,14 @@ class Adam(torch.optim.Adam):
         self.zero_grad()
 
 
-def ours(race: Race, data: DataSet) -> None:
+def ours(comparison: Comparison, data: DataSet) -> None:
     """modsoft-train without its command line."""
     settings = Settings(
-        **BY_DRIVE[data.robot.actuators.drive] | {"split": "shuffled", "batch": race.batch},
-        iterations=race.iterations,
-        layers=race.layers,
-        hidden=race.hidden,
-        seed=race.seed,
+        **BY_DRIVE[data.robot.actuators.drive] | {"split": "shuffled", "batch": comparison.batch},
+        iterations=comparison.iterations,
+        layers=comparison.layers,
+        hidden=comparison.hidden,
+        seed=comparison.seed,
     )
     turns = Turns(settings.batch)
     with tempfile.TemporaryDirectory() as folder:
@@ -106,14 +107,14 @@ def ours(race: Race, data: DataSet) -> None:
             settings,
             lambda progress: turns.report(progress.iteration, progress.validation_percent),
         )
-    turns.end_s = 0.0  # reports at once: the last validation comes after the last iteration
+    turns.end_s = 0.0  # the next report is not left out: the last validation comes after the last iteration
     turns.report(checkpoint["provenance"]["iterations_done"], checkpoint["provenance"]["validation_percent"])
 
 
-def adam(race: Race, data: DataSet) -> None:
+def adam(comparison: Comparison, data: DataSet) -> None:
     """`ours` with Adam for all parameters."""
     optimizer.MuonAndAdam = Adam  # type: ignore[misc,assignment]
-    ours(dataclasses.replace(race, iterations=ADAM_ITERATIONS * race.iterations), data)
+    ours(dataclasses.replace(comparison, iterations=ADAM_ITERATIONS * comparison.iterations), data)
 
 
 class WindowSet(Windows, torch.utils.data.Dataset):
@@ -123,13 +124,15 @@ class WindowSet(Windows, torch.utils.data.Dataset):
         return self.features[index], self.targets[index]
 
 
-def authors(race: Race, data: DataSet) -> None:
-    """The training of the paper, without an end."""
+def authors(comparison: Comparison, data: DataSet) -> None:
+    """The training of the paper's authors, until the comparison ends."""
     torch.set_num_threads(1)
-    torch.manual_seed(race.seed)
+    torch.manual_seed(comparison.seed)
     history = BY_DRIVE[data.robot.actuators.drive]["history"]
-    training, validation, _ = dataset.split(data, history, "shuffled", race.seed)
-    network = BiLSTM(training.features.shape[-1], training.targets.shape[-1], race.layers, race.hidden, dropout=0.1)
+    training, validation, _ = dataset.split(data, history, "shuffled", comparison.seed)
+    network = BiLSTM(
+        training.features.shape[-1], training.targets.shape[-1], comparison.layers, comparison.hidden, dropout=0.1
+    )
     adam_optimizer = torch.optim.Adam(network.parameters(), lr=0.001)
     windows = WindowSet(training.features, training.targets)
     loader = torch.utils.data.DataLoader(windows, batch_size=64, shuffle=True, num_workers=1)
@@ -141,19 +144,19 @@ def authors(race: Race, data: DataSet) -> None:
         adam_optimizer.zero_grad()
         loss.backward()
         adam_optimizer.step()
-        if iteration % race.authors_check == 0:
+        if iteration % comparison.authors_check == 0:
             percent = min(percent, float(estimation_errors(network, validation).mean()))
         turns.report(iteration, percent)
 
 
-WAYS: dict[str, Callable[[Race, DataSet], None]] = {"ours": ours, "adam": adam, "authors": authors}
+METHODS: dict[str, Callable[[Comparison, DataSet], None]] = {"ours": ours, "adam": adam, "authors": authors}
 
 
 def step_times(rounds: int) -> list[dict[str, Any]]:
     """Milliseconds of processor time of the training steps of `STEPS`, gradient and optimizer, medians of `rounds`."""
     torch.set_num_threads(1)
     rows = []
-    for batch, name, target_share in STEPS:
+    for batch, name, target_fraction in STEPS:
         robot = robot_file.load(name)
         history = BY_DRIVE[robot.actuators.drive]["history"]
         sizes = {"feature_size": history * (robot.state_size + robot.action_size) + 1, "action_size": robot.action_size}
@@ -174,17 +177,17 @@ def step_times(rounds: int) -> list[dict[str, Any]]:
                 "modules": robot.modules,
                 "gradient_ms": gradient_ms,
                 "optimizer_ms": optimizer_ms,
-                "share": optimizer_ms / (gradient_ms + optimizer_ms),
-                "target_share": target_share,
+                "optimizer_fraction": optimizer_ms / (gradient_ms + optimizer_ms),
+                "target_fraction": target_fraction,
             }
         )
     return rows
 
 
 if __name__ == "__main__":
-    way, argument = sys.argv[1:]
-    if way == "steps":
+    method, argument = sys.argv[1:]
+    if method == "steps":
         print(json.dumps(step_times(int(argument))))
     else:
-        race = Race(**json.loads(argument))
-        WAYS[way](race, first_samples(dataset.read(Path(race.data)), race.samples))
+        comparison = Comparison(**json.loads(argument))
+        METHODS[method](comparison, first_samples(dataset.read(Path(comparison.data)), comparison.samples))
