@@ -40,11 +40,11 @@ def test_lateness_skipped_ticks_and_bursts_are_counted(loop):
 
 def test_ratios_divide_the_lateness_of_other_loops_by_ours(loop):
     rows = [
-        {"busy": 0, "hz": 25.0, "pace": pace, "p50_ms": p50, "p99_ms": 1.0}
-        for pace, p50 in (("our ticker", 0.1), ("asyncio", 0.5))
+        {"busy": 0, "hz": 25.0, "timer": timer, "p50_ms": p50, "p99_ms": 1.0}
+        for timer, p50 in (("our ticker", 0.1), ("asyncio", 0.5))
     ]
     assert loop.ratios(rows) == [
-        {"busy": 0, "hz": 25.0, "pace": "asyncio", "p50_ms_over_ours": 5.0, "p99_ms_over_ours": 1.0}
+        {"busy": 0, "hz": 25.0, "timer": "asyncio", "p50_ms_over_ours": 5.0, "p99_ms_over_ours": 1.0}
     ]
 
 
@@ -53,10 +53,10 @@ def test_every_loop_is_measured(loop, tmp_path):
     command = [sys.executable, benchmarks.BENCH / "loop.py", "--seconds", "1", "--json", tmp_path / "figures"]
     output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout
     rows = json.loads((tmp_path / "figures").read_text())["rows"]
-    assert [(row["busy"], row["hz"], row["pace"]) for row in rows] == [
-        (busy, hz, pace) for busy in (0, 4) for hz in (2.5, 25.0, 100.0) for pace in loop.PACES
+    assert [(row["busy"], row["hz"], row["timer"]) for row in rows] == [
+        (busy, hz, timer) for busy in (0, 4) for hz in (2.5, 25.0, 100.0) for timer in loop.TIMERS
     ]
-    assert all(row["skipped"] == 0 for row in rows if row["pace"] != "our ticker")
+    assert all(row["skipped"] == 0 for row in rows if row["timer"] != "our ticker")
     assert output.count("| our ticker |") == 6
 
 

@@ -308,7 +308,7 @@ def test_benchmark_measures_prints_and_draws(tmp_path):
     benchmark = benchmarks.load("simulation")
     result = benchmark.measured(["pneumatic"], [2], [1, 8], rounds=1)
     assert [row["robots"] for row in result["rows"]] == [1, 8]
-    assert all(row["fleet_us"] > 0 and 0 < row["share_of_peak"] < 1 for row in result["rows"])
+    assert all(row["fleet_us"] > 0 and 0 < row["fraction_of_peak"] < 1 for row in result["rows"])
     assert all(row["ratio"] == row["elastica_us"] / row["fleet_us"] for row in result["rows"])
     assert result["about"]["variant"] == fleet_kernel.variants()[-1]
     assert result["two_threads"]["ratio_to_peak"] > 0

@@ -1,8 +1,8 @@
 """Latency of a control tick by stage, from the tracker's answer to the valve's register, for 2, 3 and 5 modules.
 
 `python tools/bench/latency.py --isa native|avx2 --report docs/latency.md`. `latency_stages.py` describes the stages.
-Ours are all stages but wire and firmware. Other load of the machine increases the times, so its load average is
-recorded.
+Column `ours` is the sum of all stages except wire and firmware. Other load of the machine increases the times, so its
+load average is recorded.
 
 `--isa avx2` limits numpy. onnxruntime selects its kernels by the processor and has no such option.
 """
@@ -89,7 +89,7 @@ def section(result: report.Result) -> str:
 )
 def main(isa: str, json_file: Path | None, page: report.Page | None, quick: bool, model: Path | None) -> None:
     if isa == "avx2" and (limits := limited_to_avx2())["NPY_DISABLE_CPU_FEATURES"]:
-        # numpy reads the limit when it is imported
+        # In a new process, because numpy reads the limit when it is imported.
         environment = report.script_environment(**limits)
         raise SystemExit(subprocess.run([sys.executable, *sys.argv], env=environment).returncode)
     count = 60 if quick else 120

@@ -1,9 +1,9 @@
 """Lateness of control ticks: our ticker, time.sleep and asyncio, at 2.5, 25 and 100 Hz, on a free and a busy core.
 
-`python tools/bench/loop.py`. All nine loops run at the same time, each as a process on the same core, with their ticks
-spread over 10 ms so that none meets another; a disturbance affects all alike. Busy: four processes that never sleep
-share the core with them. All three wait for absolute deadlines. The other two run a late tick at once; ours skips it if
-it is more than half a period late. Lateness is that of the ticks that ran.
+`python tools/bench/loop.py`. All nine loops run at the same time, so that other load affects all alike: each is a
+process on the same core, and their ticks are spread over 10 ms so that no two coincide. On the busy core four processes
+that never sleep run as well. All timers wait for absolute deadlines. Our ticker skips a tick that is more than half a
+period late; the other two run it at once. Lateness is that of the ticks that ran.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from modsoft.runtime.stop import Stop
 from modsoft.study.cells import table
 
 RATES_HZ = (2.5, 25.0, 100.0)
-BUSY = 4
-START_S = 0.5  # after all processes have started
-SPREAD_S = 0.01
+BUSY_PROCESSES = 4
+START_S = 0.5  # from the start of all processes to the first tick
+SPREAD_S = 0.01  # over which the first ticks of the loops are spread
 
 Ticks = list[tuple[float, float]]  # (due, begun), seconds of the monotonic clock
 
@@ -64,18 +64,18 @@ def with_asyncio(period_s: float, start_s: float, end_s: float) -> Ticks:
     return asyncio.run(loop())
 
 
-PACES: dict[str, Callable[[float, float, float], Ticks]] = {
+TIMERS: dict[str, Callable[[float, float, float], Ticks]] = {
     "our ticker": our_ticker,
     "time.sleep": sleep,
     "asyncio": with_asyncio,
 }
 
 
-def paced(pace: str, period_s: float, core: int, connection: Connection) -> None:
+def run_loop(timer: str, period_s: float, core: int, connection: Connection) -> None:
     """A process with one loop: reports that it has started, receives the start and end time, sends its ticks."""
     os.sched_setaffinity(0, {core})
     connection.send("started")
-    connection.send(PACES[pace](period_s, *connection.recv()))
+    connection.send(TIMERS[timer](period_s, *connection.recv()))
 
 
 def busy(core: int) -> None:
@@ -106,23 +106,24 @@ def figures(ticks: Ticks, period_s: float, planned: int) -> dict[str, float | in
 def measured(seconds: float, busy_processes: int, core: int) -> list[dict[str, Any]]:
     """All nine loops at once, for so many seconds."""
     spawn = mp.get_context("spawn")
-    loops = [(pace, hz, *spawn.Pipe()) for hz in RATES_HZ for pace in PACES]
-    processes = [spawn.Process(target=paced, args=(pace, 1 / hz, core, theirs)) for pace, hz, _, theirs in loops]
+    loops = [(timer, hz, *spawn.Pipe()) for hz in RATES_HZ for timer in TIMERS]
+    processes = [spawn.Process(target=run_loop, args=(timer, 1 / hz, core, child)) for timer, hz, _, child in loops]
     others = [spawn.Process(target=busy, args=(core,), daemon=True) for _ in range(busy_processes)]
     for process in processes:
         process.start()
-    for _, _, ours, _ in loops:
-        ours.recv()
+    for _, _, connection, _ in loops:
+        connection.recv()
     for process in others:
         process.start()
     start_s = time.monotonic() + START_S
-    for place, (_, _, ours, _) in enumerate(loops):
-        begin_s = start_s + SPREAD_S * place / len(loops)
-        ours.send((begin_s, begin_s + seconds))
-    rows = [
-        {"busy": busy_processes, "hz": hz, "pace": pace, **figures(ours.recv(), 1 / hz, math.ceil(seconds * hz - 1e-9))}
-        for pace, hz, ours, _ in loops
-    ]
+    for number, (_, _, connection, _) in enumerate(loops):
+        begin_s = start_s + SPREAD_S * number / len(loops)
+        connection.send((begin_s, begin_s + seconds))
+    rows = []
+    for timer, hz, connection, _ in loops:
+        planned = math.ceil(seconds * hz - 1e-9)  # a rounding error does not count as a tick
+        row = {"busy": busy_processes, "hz": hz, "timer": timer}
+        rows.append({**row, **figures(connection.recv(), 1 / hz, planned)})
     for process in others:
         process.terminate()
     for process in [*processes, *others]:
@@ -132,14 +133,14 @@ def measured(seconds: float, busy_processes: int, core: int) -> list[dict[str, A
 
 def ratios(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Lateness of the others divided by ours, at the same rate and load."""
-    ours = {(row["busy"], row["hz"]): row for row in rows if row["pace"] == "our ticker"}
+    ours = {(row["busy"], row["hz"]): row for row in rows if row["timer"] == "our ticker"}
     return [
         {
-            **{name: row[name] for name in ("busy", "hz", "pace")},
+            **{name: row[name] for name in ("busy", "hz", "timer")},
             **{f"{name}_over_ours": row[name] / ours[row["busy"], row["hz"]][name] for name in ("p50_ms", "p99_ms")},
         }
         for row in rows
-        if row["pace"] != "our ticker"
+        if row["timer"] != "our ticker"
     ]
 
 
@@ -149,8 +150,8 @@ def section(result: report.Result) -> str:
     for row in result["rows"]:
         lateness = [f"{row[name]:.3f}" for name in ("p50_ms", "p99_ms", "p99_9_ms", "max_ms")]
         gaps = [row["skipped"], f"{row['shortest_gap']:.2f}", row["bursts"]]
-        rows.append([row["pace"], row["busy"], f"{row['hz']:g}", row["ticks"], *lateness, *gaps])
-    heads = ["pace", "busy processes", "Hz", "ticks", "p50 ms", "p99 ms", "p99.9 ms", "max ms"]
+        rows.append([row["timer"], row["busy"], f"{row['hz']:g}", row["ticks"], *lateness, *gaps])
+    heads = ["timer", "busy processes", "Hz", "ticks", "p50 ms", "p99 ms", "p99.9 ms", "max ms"]
     heads += ["skipped", "shortest gap / period", "gaps below half"]
     machine = f"{about['system']}, {about['cores']} cores, load average {about['load_average']:.1f} before"
     duration = f"{about['seconds']:g} s each, all at once on core {about['core']}"
@@ -166,7 +167,7 @@ def main(json_file: Path | None, seconds: float, quick: bool) -> None:
     seconds = 10.0 if quick else seconds
     core = max(os.sched_getaffinity(0))
     about = report.about(seconds=seconds, core=core)
-    rows = [row for others in (0, BUSY) for row in measured(seconds, others, core)]
+    rows = [row for busy_processes in (0, BUSY_PROCESSES) for row in measured(seconds, busy_processes, core)]
     result = {"about": about, "rows": rows, "ratios": ratios(rows)}
     report.publish(result, section, json_file)
 

@@ -1,12 +1,12 @@
-"""Performance of the simulation kernel: a time step of the fleet against PyElastica, one robot and eight in a block.
+"""Performance of the simulation kernel: a time step of the fleet compared with PyElastica, alone and in a block of 8.
 
 `python tools/bench/simulation.py --isa native|avx2 --report docs/simulation.md`. `--compare` measures instead the
 difference of their configurations.
 
 Everything is measured in one run, in short turns that follow each other, so that other load on the machine affects all
-alike. A figure is the least processor time of its turns; only two threads against one are measured by the wall clock.
-The fraction of the core's peak counts the arithmetic in fleet_kernel.h by hand (a multiply-add is two operations, a
-division or a root one), against independent multiply-adds with vectors of the same width.
+alike. A figure is the least processor time of its turns; only the gain of a second thread is measured by wall clock.
+The fraction of peak is the number of operations in fleet_kernel.h, counted by hand (a multiply-add is two operations, a
+division or a root is one), over that of independent multiply-adds with vectors of the same width in the same time.
 """
 
 from __future__ import annotations
@@ -124,10 +124,10 @@ def measured(kinds: list[str], module_numbers: list[int], counts: list[int], rou
         for modules in module_numbers:
             try:
                 part = turns(kind, modules, counts)
-                for _ in range(rounds + 2):
+                for _ in range(rounds + 2):  # more turns than are measured: none of those diverges
                     part["elastica"][1]()
-            except ModsoftError:  # PyElastica's robot diverges at once
-                click.echo(f"a {kind} robot of {modules} modules diverges: left out")
+            except ModsoftError:
+                click.echo(f"a {kind} robot of {modules} modules diverges in PyElastica: left out")
             else:
                 parts[kind, modules] = part
     calls: dict[Any, Call] = {(*key, name): turn for key, part in parts.items() for name, (_, turn) in part.items()}
@@ -160,7 +160,7 @@ def figures(kind: str, modules: int, count: int, us: dict[str, float], peak: flo
         "elastica_block_us": us["elastica block of 8"],
         "ratio": us["elastica"] / cost,
         "ratio_block": us["elastica block of 8"] / cost,
-        "share_of_peak": operations / (1e-6 * cost) / peak,
+        "fraction_of_peak": operations / (1e-6 * cost) / peak,
     }
 
 

@@ -32,7 +32,7 @@ def section(result: report.Result) -> str:
         if (row["modules"], row["robots"]) not in PAGE_ROWS:
             continue
         times = [f"{row['fleet_us']:.3f}", f"{row['elastica_us']:.1f}", f"{row['elastica_block_us']:.1f}"]
-        ratios = [f"{row['ratio']:.1f}", f"{row['ratio_block']:.1f}", f"{100 * row['share_of_peak']:.0f} %"]
+        ratios = [f"{row['ratio']:.1f}", f"{row['ratio_block']:.1f}", f"{100 * row['fraction_of_peak']:.0f} %"]
         rows.append([row["kind"], row["modules"], row["robots"], *times, *ratios])
     return "\n".join([*lines, *table([*heads, "fraction of peak"], rows), _two_threads(result["two_threads"])])
 
