@@ -10,12 +10,12 @@
 #endif
 
 #define INPUTS PROTOCOL_CHANNELS
-/* After the last input, once in ROUNDS_PER_SUPPLY rounds: the 1.1 V reference, measured against the supply. It settles
- * slowly after it is selected, so its first conversion is discarded. */
+/* Once in ROUNDS_PER_SUPPLY rounds, after the last input, the 1.1 V reference is measured against the supply, from which
+ * the supply follows. It settles slowly after it is selected, so its first conversion is discarded. */
 #define SETTLING INPUTS
 #define SUPPLY (INPUTS + 1)
 #define ROUNDS_PER_SUPPLY 8 /* twice in SUPPLY_MS with 6 sensors, once with 12 */
-#define LEAST_READING 19    /* of the reference; less would be a supply of more than 59 V */
+#define LEAST_READING 19    /* of the reference; with less the supply may not fit 16 bits, and no supply exceeds 59 V */
 
 static bool has_sensor(uint8_t input) { return (SENSORS >> input) & 1; }
 

@@ -317,8 +317,8 @@ static uint8_t check_sensors(struct supervisor *s, uint32_t elapsed_ms) {
   return CHECK_SENSORS;
 }
 
-/* A sagging supply lowers every valve's command in proportion, so a ramp is safe; a supply that is not measured (0) is
- * too low as well. */
+/* A sagging supply lowers every valve's command in proportion, so a ramp is safe. A supply that is not measured (0)
+ * counts as too low. */
 static uint8_t check_supply(struct supervisor *s, uint32_t elapsed_ms) {
   if (lasts(&s->supply_low_ms, s->supply_mv < SUPPLY_LEAST_MV, elapsed_ms, SUPPLY_MS)) {
     latch(s, FAULT_SUPPLY); /* in any state */

@@ -54,7 +54,7 @@ struct supervisor {
 
   int16_t measured[PROTOCOL_CHANNELS];
   uint16_t over_ms[PROTOCOL_CHANNELS];                               /* time above P_OVER */
-  uint16_t above_ms[PROTOCOL_CHANNELS], below_ms[PROTOCOL_CHANNELS]; /* time off the applied pressure */
+  uint16_t above_ms[PROTOCOL_CHANNELS], below_ms[PROTOCOL_CHANNELS]; /* time P_DISAGREE off the applied pressure */
   uint16_t implausible_ms[PROTOCOL_CHANNELS];                        /* time outside the sensor's range */
   uint16_t supply_mv;
   uint16_t supply_low_ms; /* time below SUPPLY_LEAST_MV */
