@@ -1,4 +1,4 @@
-"""The firmware's source, compiled for this machine with a sanitiser, on virtual time."""
+"""The firmware's logic, compiled for this machine with the sanitiser of undefined behaviour, on virtual time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from modsoft.runtime.board import codec, protocol
 
 ROOT = Path(__file__).resolve().parents[2]
-BUILT = "MODSOFT_NATIVE_FIRMWARE"
+PREBUILT_FOLDER = "MODSOFT_NATIVE_FIRMWARE"  # environment variable, set by tools/mutate.py and measure_coverage.py
 
 
 class NativeBoard:
@@ -133,8 +133,8 @@ class NativeBoard:
 
 @pytest.fixture(scope="session")
 def native() -> Path:
-    """The folder with the firmware compiled for this machine: built now, or given by the environment variable."""
-    if folder := os.environ.get(BUILT):
+    """The folder with the firmware compiled for this machine: built now, or that of the environment variable."""
+    if folder := os.environ.get(PREBUILT_FOLDER):
         return Path(folder)
     if shutil.which("gcc") is None or shutil.which("make") is None:
         pytest.skip("needs gcc and make")

@@ -16,7 +16,7 @@ BOOTLOADER_MS = 4800  # its duration after it received a byte
 
 
 class VirtualPort:
-    """A port that is connected to a native board; a read advances time, one millisecond a step."""
+    """A port that is connected to a native board; reading advances the time, one millisecond a step."""
 
     def __init__(self, make_board, reset_on_open=True, firmware=True):
         self.make_board = make_board
@@ -143,7 +143,7 @@ def run(board, port, seconds, pressures=HALF, first_tick=1, hz=2.5):
     return first_tick + round(seconds * hz)
 
 
-def test_complete_run(rig):
+def test_run_arms_follows_set_points_and_vents(rig):
     board, port = rig
     assert port.board.state == State.IDLE
     board.arm(ROBOT)
@@ -190,7 +190,7 @@ def test_silent_port_is_reset_three_times_before_the_error(new_board):
     assert not port.is_open
 
 
-def test_first_hello_lost_then_reset(port):
+def test_lost_first_hello_causes_one_reset(port):
     port.sends_nothing = True
     original = port.reset
 
@@ -251,7 +251,7 @@ def test_foreign_protocol_is_refused(new_board, monkeypatch):
     assert port.written == []
 
 
-def test_noise_instead_of_frames(new_board):
+def test_noise_is_reported_as_wrong_baud_rate(new_board):
     port = VirtualPort(new_board, firmware=False)
     port.pending = bytes(range(256)) * 4
     with pytest.raises(DeviceAbsent, match="wrong baud rate"):
@@ -356,7 +356,7 @@ def test_arming_succeeds_after_a_lost_answer(rig):
     assert port.board.state == State.RUNNING
 
 
-def test_host_killed(rig):
+def test_board_vents_within_670_ms_of_the_last_byte_of_a_killed_host(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2, pressures=np.full(6, 0.35))
@@ -405,7 +405,7 @@ def test_board_keeps_running_while_the_loop_holds_its_set_points(rig):
     assert port.board.state == State.RUNNING
 
 
-def test_unplugged_cable(rig):
+def test_unplugged_cable_is_a_loss_without_a_confirmed_vent(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 2)
@@ -466,7 +466,7 @@ def test_board_that_sends_nothing_is_lost(rig):
     assert port.now_ms == listened_until  # it does not wait again
 
 
-def test_board_reset_in_mid_run(rig):
+def test_board_reset_in_mid_run_is_detected_and_no_more_is_sent(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
@@ -485,7 +485,7 @@ def test_board_reset_in_mid_run(rig):
     assert port.board.state == State.IDLE
 
 
-def test_a_set_point_that_waits_while_the_board_restarts_is_never_sent(rig):
+def test_waiting_set_point_is_never_sent_to_a_restarted_board(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 1)
@@ -500,7 +500,7 @@ def test_a_set_point_that_waits_while_the_board_restarts_is_never_sent(rig):
     assert not any(port.board.counts)
 
 
-def test_vented_is_a_status_from_after_the_request(rig):
+def test_vent_is_confirmed_only_by_a_status_after_the_request(rig):
     """A status that was sent before the request proves nothing: the board may have been armed since."""
     board, port = rig
     port.run(110)
@@ -515,7 +515,7 @@ def test_vented_is_a_status_from_after_the_request(rig):
     assert port.now_ms - 1e3 * board.status_age_s > requested_ms
 
 
-def test_sensor_shows_a_valve_that_stays_open(rig):
+def test_open_valve_is_reported_as_residual_pressure(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
@@ -580,7 +580,7 @@ def test_set_pressures_takes_one_dimension(rig):
         board.set_pressures(1, np.zeros(13))
 
 
-def test_only_the_newest_set_point_is_sent_and_only_once(rig):
+def test_only_newest_set_point_is_sent_and_only_once(rig):
     board, port = rig
     board.arm(ROBOT)
     board.set_pressures(1, np.full(6, 0.1))

@@ -38,7 +38,7 @@ def test_builds_in_a_folder_of_any_name(tmp_path):
 
 
 @pytest.mark.parametrize("setting", ["OUT=/tmp/My Drive", "ARDUINO=/tmp/a:b"])
-def test_a_path_that_make_does_not_accept_gives_one_line(setting):
+def test_path_that_make_does_not_accept_is_refused_in_one_line(setting):
     command = ["make", "-C", str(FIRMWARE), "--no-print-directory", setting]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2

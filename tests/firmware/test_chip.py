@@ -101,7 +101,7 @@ def test_counts_reach_the_register_of_their_pin_and_no_other(chip, outputs, chan
     assert bytes(chip.registers) == before
 
 
-def test_the_pin_of_the_bootloader_is_not_used(chip):
+def test_pin_of_the_bootloader_is_not_used(chip):
     chip.code.pwm_begin()
     before = bytes(chip.registers)
     for channel in (11, 12, 255):
@@ -160,7 +160,7 @@ def test_supply_first_then_8_rounds_of_all_sensors(chip):
     assert chip.registers[ADCSRA] & CONVERTING
 
 
-def test_supply_voltage(chip):
+def test_supply_follows_from_the_settled_reference(chip):
     sensors = begin(chip)
     convert(chip, sensors, 1)
     assert sensors.supply_mv == 0  # the reference has not settled
@@ -173,7 +173,7 @@ def test_supply_voltage(chip):
         assert sensors.supply_mv == supply_mv
 
 
-def test_pressures(chip):
+def test_readings_become_pressures(chip):
     sensors = begin(chip)
     for _ in range(2):
         convert(chip, sensors, 225)
@@ -267,7 +267,7 @@ def test_power_on_gives_a_random_id_and_every_reset_the_next_one(chip):
         (0b0011, ResetCause.POWER_ON),
     ],
 )
-def test_the_flags_of_the_chip_give_the_cause(chip, flags, cause):
+def test_reset_flags_give_the_cause(chip, flags, cause):
     chip.boot()
     assert chip.boot(flags)[1] == cause
     assert chip.registers[MCUSR] == 0, "the flags would remain after the next reset"
@@ -284,7 +284,7 @@ def test_clock_shows_a_watchdog_reset_after_the_bootloader(chip, hung_ms, cause)
 
 
 @pytest.mark.parametrize(("supply_mv", "cause"), [(4499, ResetCause.BROWN_OUT), (4500, ResetCause.EXTERNAL)])
-def test_behind_the_bootloader_a_low_supply_shows_a_brown_out(chip, supply_mv, cause):
+def test_low_supply_shows_a_brown_out_after_the_bootloader(chip, supply_mv, cause):
     chip.boot()
     chip.code.boot_feed_watchdog(5000, supply_mv)
     chip.millis.value = 5001

@@ -16,7 +16,7 @@ from modsoft.runtime.board import cobs, codec, protocol
 
 @pytest.mark.parametrize("kind", ["flip", "drop", "insert", "truncate", "garbage", "repeat"])
 def test_corrupted_and_repeated_frames_are_not_applied(native, kind):
-    """A short run of tools/fuzz; tests/reliability has the counts of the failure matrix."""
+    """A short run of tools/fuzz/corrupt.c; the failure matrix (tests/reliability) has more tries."""
     done = subprocess.run([native / "corrupt", kind, "20000"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
@@ -25,7 +25,7 @@ def test_corrupted_and_repeated_frames_are_not_applied(native, kind):
 
 
 @pytest.mark.parametrize(("length", "accepted"), [(protocol.MAX_DECODED, True), (protocol.MAX_DECODED + 1, False)])
-def test_longest_frame(board, length, accepted):
+def test_longest_frame_is_accepted_and_a_longer_one_dropped(board, length, accepted):
     """The longest frame is answered (as an unknown type), a longer one is dropped, and the next frame is accepted."""
     body = bytes((0x7F, 5, 0)) + bytes(range(1, length - 6))
     board.messages()
@@ -53,7 +53,7 @@ def test_endless_frame_is_dropped(board):
     assert isinstance(board.send(protocol.HelloReq(protocol.PROTOCOL_HASH))[0], protocol.Hello)
 
 
-def test_crc_is_zlibs(sanitised):
+def test_crc_is_that_of_zlib(sanitised):
     for data in (b"", b"123456789", *(bytes((start + n * n) % 256 for n in range(255)) for start in range(64))):
         assert sanitised.frame_crc32(data, len(data)) == zlib.crc32(data)
 

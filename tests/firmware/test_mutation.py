@@ -36,7 +36,7 @@ def changed(mutate, code):
         ("return false;", {"return true;"}),
     ],
 )
-def test_changes(mutate, code, expected):
+def test_each_token_has_its_changes(mutate, code, expected):
     assert changed(mutate, code) == expected
 
 

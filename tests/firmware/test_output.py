@@ -22,13 +22,13 @@ def step(library, stage, target, elapsed_ms=1, times=1):
 @pytest.mark.parametrize(
     ("target", "reached"), [(3501, 3500), (32767, 3500), (-1, 0), (-32768, 0), (1, 1), (3499, 3499)]
 )
-def test_clamp(sanitised, target, reached):
+def test_output_stays_between_0_and_p_max(sanitised, target, reached):
     stage = OutputStage()
     assert step(sanitised, stage, target, times=300) == reached
     assert list(stage.applied) == [reached] * 11 + [0]  # channel 11 is the bootloader's LED
 
 
-def test_slew_both_ways(sanitised):
+def test_output_rises_and_falls_at_the_slew_limit(sanitised):
     stage = OutputStage()
     assert [step(sanitised, stage, 50) for _ in range(4)] == [20, 40, 50, 50]
     assert [step(sanitised, stage, 0) for _ in range(4)] == [30, 10, 0, 0]
@@ -59,7 +59,7 @@ def test_vented_means_every_channel_at_zero(sanitised):
         assert not sanitised.output_is_vented(ctypes.byref(stage))
 
 
-def test_counts_from_zero_to_full_scale(sanitised):
+def test_counts_are_proportional_to_the_pressure(sanitised):
     stage = OutputStage()
     sanitised.output_counts.restype = ctypes.c_uint16
     counts = []
@@ -69,7 +69,7 @@ def test_counts_from_zero_to_full_scale(sanitised):
     assert counts == [0, 0, 1, 137, 478, 4096]
 
 
-def test_slew_with_a_fractional_step(native):
+def test_fractional_step_keeps_the_mean_rate_exact(native):
     """The remainder of a step is kept, so that the mean rate is exact."""
     library = ctypes.CDLL(str(native / "libslew.so"))
     stage = OutputStage()

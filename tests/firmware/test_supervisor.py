@@ -67,7 +67,7 @@ def test_status_is_sent_every_100_ms(board):
     assert board.library.supervisor_next_byte(board.handle) == -1
 
 
-def test_hello_on_request_in_any_state(running):
+def test_hello_is_sent_on_request_while_running(running):
     assert any(isinstance(answer, Hello) for answer in running.send(HelloReq(protocol.PROTOCOL_HASH)))
     assert running.state == State.RUNNING
 
@@ -189,7 +189,7 @@ def test_long_wait_before_the_first_set_point_is_no_control_timeout(board):
         ({"p_full": 100000}, NackReason.RANGE),
     ],
 )
-def test_arm_refused(board, changes, expected):
+def test_arm_with_a_wrong_field_is_refused(board, changes, expected):
     board.heartbeats(1100)
     assert reason(board.arm(**changes)) == expected
     assert board.state == State.IDLE
@@ -211,7 +211,7 @@ def test_arm_for_another_session_while_armed_refused(board, session, expected):
     assert reason(board.set(800, session=session)) == NackReason.SESSION
 
 
-def test_arm_refused_while_running_and_old_arm_afterwards(running):
+def test_arm_while_running_and_old_arm_afterwards_are_refused(running):
     assert reason(running.arm()) == NackReason.STATE
     running.send(Vent(VentMode.DUMP))
     running.follow()
@@ -240,7 +240,7 @@ def test_session_numbers_wrap_and_skip_zero(board):
 # ---- set-points
 
 
-def test_slew_and_clamp(board):
+def test_outputs_reach_the_set_points_at_the_slew_limit(board):
     board.heartbeats(1100)
     board.arm()
     board.set(*FULL)
@@ -265,7 +265,7 @@ def test_counts_are_the_pressure_over_full_scale(running):
 
 
 @pytest.mark.parametrize("pressures", [(-1,), (3501,), (800, 32767), (0, 0, 0, 0, 0, 0, 800), (0,) * 11 + (800,)])
-def test_out_of_range_rejects_the_whole_frame(running, pressures):
+def test_set_out_of_range_is_refused_as_a_whole(running, pressures):
     before = [running.library.board_set_point(running.handle, channel) for channel in range(12)]
     assert reason(running.set(*pressures)) == NackReason.RANGE
     assert [running.library.board_set_point(running.handle, channel) for channel in range(12)] == before
@@ -282,7 +282,7 @@ def test_set_and_heartbeat_of_another_session_refused(running):
     assert reason(running.send(protocol.Heartbeat(99), session=0)) == NackReason.SESSION
 
 
-def test_sequence_window(running):
+def test_set_is_accepted_up_to_8_sequence_numbers_ahead(running):
     last = running.seq
     for ahead in (9, 100, 128, 255):
         assert reason(running.set(800, seq=(last + ahead) & 0xFF)) == NackReason.SEQUENCE
@@ -496,7 +496,7 @@ def test_over_pressure_is_detected_while_idle_and_stays_latched(board):
 
 
 @pytest.mark.parametrize(("reading", "fault"), [(1499, Fault.LEAK), (2501, Fault.SENSOR)])
-def test_sensor_that_does_not_follow_the_output(running, reading, fault):
+def test_sensor_that_does_not_follow_the_output_is_a_fault(running, reading, fault):
     running.measured[3] = reading
     running.heartbeats(1900)
     running.heartbeats(99)
@@ -717,7 +717,7 @@ def test_lowest_allowed_supply_is_no_fault(running):
 
 
 @pytest.mark.parametrize(("units", "faulty"), [(-1251, True), (-1250, False), (21250, False), (21251, True)])
-def test_range_of_sensors_with_an_offset(board45, units, faulty):
+def test_sensor_with_an_offset_outside_its_range_is_a_fault(board45, units, faulty):
     """Below 0.25 V and above 4.75 V the wire is broken."""
     (hello,) = [frame.message for frame in board45.messages()]
     assert (hello.sensor_zero_mv, hello.sensor_full_mv, hello.sensor_full) == (500, 4500, 20000)
