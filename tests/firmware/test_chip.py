@@ -32,7 +32,7 @@ class Sensors(ctypes.Structure):
 
 
 class Chip:
-    """A chip after power-on: each copy of the library has its own memory."""
+    """A chip after power-on."""
 
     def __init__(self, library: Path) -> None:
         self.code = ctypes.CDLL(str(library))
@@ -53,11 +53,16 @@ class Chip:
         return self.code.boot_next_id(), ResetCause(self.code.boot_reset_cause())
 
 
+def chip_of(library, folder):
+    """A chip with its own copy of the library in `folder`, and so with its own memory."""
+    if not library.exists():
+        pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
+    return Chip(shutil.copy(library, folder))
+
+
 @pytest.fixture
 def chip(native, tmp_path):
-    if not (native / "libchip.so").exists():
-        pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
-    return Chip(shutil.copy(native / "libchip.so", tmp_path))
+    return chip_of(native / "libchip.so", tmp_path)
 
 
 # ---- PWM
@@ -185,9 +190,7 @@ def test_readings_become_pressures(chip):
 @pytest.fixture
 def sensor45(native, tmp_path):
     """Channels 0, 7, 8 and 11 with sensors of 0.5 V at 0 and 4.5 V at 2 bar."""
-    if not (native / "libsensor45.so").exists():
-        pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
-    return Chip(shutil.copy(native / "libsensor45.so", tmp_path))
+    return chip_of(native / "libsensor45.so", tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -206,9 +209,7 @@ def test_pressure_of_a_sensor_with_an_offset(sensor45, millivolt, units):
 
 def test_pressures_beyond_the_protocol_are_limited(native, tmp_path):
     """Readings of 32768.1 and -32768.1 units; -32768 is NOT_MEASURED."""
-    if not (native / "libsensor9bar.so").exists():
-        pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
-    chip = Chip(shutil.copy(native / "libsensor9bar.so", tmp_path))
+    chip = chip_of(native / "libsensor9bar.so", tmp_path)
     sensors = begin(chip)
     for _ in range(2):
         convert(chip, sensors, 225)
@@ -235,9 +236,7 @@ def test_inputs_8_to_11_are_selected_by_the_sixth_bit(sensor45):
 
 
 def test_without_sensors_only_the_supply_is_measured(native, tmp_path):
-    if not (native / "libsensorless.so").exists():
-        pytest.skip("needs Debian package avr-libc, for the names of the chip's registers")
-    chip = Chip(shutil.copy(native / "libsensorless.so", tmp_path))
+    chip = chip_of(native / "libsensorless.so", tmp_path)
     sensors = begin(chip)
     assert {convert(chip, sensors, 225) for _ in range(500)} == {REFERENCE}
     assert sensors.supply_mv == 1100 * 1024 // 225
