@@ -1,7 +1,7 @@
-"""The one thing that pyproject.toml cannot say: how the fast plant (training/simulation/fleet.c) is compiled.
+"""How the kernel of the simulated robots (training/simulation/fleet.c) is compiled; all else is in pyproject.toml.
 
-Optional: without a C compiler, or with one that has no vector extensions, everything else installs and PyElastica
-serves. The vector width is chosen when it runs, so a wheel is for every processor of its architecture.
+The kernel is optional: without a C compiler, or with one that has no vector extensions, PyElastica is used instead. The
+vector width is chosen at run time, so a wheel runs on every processor of its architecture.
 """
 
 from setuptools import Extension, setup
@@ -10,7 +10,7 @@ from setuptools.errors import CompileError
 
 
 class BuildKernel(build_ext):
-    """Leaves out at once what Microsoft's compiler cannot compile, instead of after a page of its errors."""
+    """Does not try Microsoft's compiler, which cannot compile the kernel and would print a page of errors."""
 
     def build_extension(self, extension):
         if self.compiler.compiler_type == "msvc":

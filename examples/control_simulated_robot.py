@@ -15,10 +15,10 @@ SHIPPED = Path(__file__).resolve().parents[1] / "tools" / "models" / "pneumatic-
 def main() -> None:
     robot = robot_file.load("pneumatic-3")
     model = Model.load(Path(sys.argv[1]) if len(sys.argv) > 1 else SHIPPED)
-    model.check(robot)  # trained for a robot of this kind?
+    model.check(robot)  # raises an error if it was trained for another kind of robot
     desired = task("down", "planar", robot.modules)  # (K, N, 3), one configuration a control step
-    arm = simulated("pneumatic", robot.modules, 1)
-    run = rollout(arm, [ControllerSetup(robot, model.actuate, model.history, desired)]).robots()[0]
+    simulator = simulated("pneumatic", robot.modules, 1)
+    run = rollout(simulator, [ControllerSetup(robot, model.actuate, model.history, desired)]).robots()[0]
     for module, error in enumerate(angle_errors_deg(run.configuration, desired).mean(axis=0), start=1):
         print(f"module {module}: mean error of the bending angle {error:.2f} degrees")
 

@@ -1,6 +1,6 @@
-"""Arm a board, set one pressure, read what it measures, vent: python examples/talk_to_the_board.py [PORT]
+"""Arm a board, set one pressure, read the applied pressures, vent: python examples/talk_to_the_board.py [PORT]
 
-Without PORT the firmware, compiled for this computer, plays the board. With a real one: no air supply, please.
+Without PORT the firmware compiled for this computer is the board. Turn the air off before you use a real board.
 """
 
 import sys
@@ -27,8 +27,8 @@ def main() -> None:
         for tick in range(3):  # a board that receives nothing for 0.3 s vents by itself
             board.set_pressures(tick, pressures_bar)
             time.sleep(0.1)
-        board.check()  # raises what went wrong
-        print("commanded, bar:", np.round(board.applied_bar, 3))
+        board.check()  # raises an error if the board is lost or reports a fault
+        print("applied, bar:", np.round(board.applied_bar, 3))
         print("vented:", board.vent())
 
 

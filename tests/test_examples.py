@@ -34,7 +34,7 @@ def test_simulated_robot_follows_its_task(tmp_path):
 @pytest.mark.realtime
 def test_board_arms_and_vents(tmp_path):
     output = run("talk_to_the_board.py", folder=tmp_path)
-    assert "0.1 " in output.split("commanded, bar:")[1]
+    assert "0.1 " in output.split("applied, bar:")[1]
     assert "vented: True" in output
 
 
