@@ -15,7 +15,7 @@
 #define SETTLING INPUTS
 #define SUPPLY (INPUTS + 1)
 #define ROUNDS_PER_SUPPLY 8 /* twice in SUPPLY_MS with 6 sensors, once with 12 */
-#define LEAST_READING 19    /* of the reference; with less the supply may not fit 16 bits, and no supply exceeds 59 V */
+#define LEAST_READING 19    /* of the reference; a smaller one means more than 59 V, which may not fit 16 bits */
 
 static bool has_sensor(uint8_t input) { return (SENSORS >> input) & 1; }
 
