@@ -42,6 +42,7 @@ class ClientProcess:
     def __init__(self, open_source: Opener, name: str, now: Callable[[], float] = time.monotonic):
         """`name`: of the tracker, for messages."""
         self._open_source, self._name, self._now = open_source, name, now
+        self.device = ""
         self._process: Any = None
         self._last: TrackerFrame | None = None
         self._shift = 0  # added to the device's frame numbers
@@ -118,6 +119,7 @@ class ClientProcess:
         elif isinstance(message, messages.Ready):
             self._allowed_s = SILENCE_S
             self._connections += 1
+            self.device = message.device
         return message
 
     def _await_ready(self) -> None:
@@ -199,7 +201,7 @@ def _serve(send: Callable[[messages.AnyMessage], None], open_source: Opener) -> 
             continue
         is_first = False
         try:
-            send(messages.Ready())
+            send(messages.Ready(source.device[:1000]))
             _send_frames(send, source)
         finally:
             source.close()

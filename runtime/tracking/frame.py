@@ -38,10 +38,12 @@ class TrackerFrame:
 
 
 class Source(Protocol):
-    """Where frames come from. `read` returns None when there is no new frame, may block, and raises `FrameError` for
-    what the next read may overcome. One thread reads and closes a source: the clients of trackers are not
-    thread-safe."""
+    """Where frames come from. `device`: firmware and serial number as the client reports them. `read` returns None when
+    there is no new frame, may block, and raises `FrameError` for what the next read may overcome. One thread reads and
+    closes a source: the clients of trackers are not thread-safe."""
 
+    @property
+    def device(self) -> str: ...
     def read(self) -> TrackerFrame | None: ...
     def close(self) -> None: ...
 

@@ -25,7 +25,9 @@ class Connecting(Message, frozen=True):
 
 
 class Ready(Message, frozen=True):
-    """The tracker is open; frames follow."""
+    """The tracker is open; frames follow. `device`: of the source."""
+
+    device: Text = ""
 
 
 class Failed(Message, frozen=True):

@@ -54,6 +54,7 @@ class NDI:
         self._errors = 0
         self._rate = FrameRate(frame_hz)
         self._client = _connected(kind, port, checked_tools(kind, tools, count))
+        self.device = described(self._client.version)
         try:
             self._handles = [int(handle) for handle in self._client.get_tool_descriptions()[0]]
             if len(self._handles) != count:
@@ -165,6 +166,7 @@ def _connected(kind: str, port: str, tools: list[Path]) -> Any:
             raise DeviceAbsent(f"no tracker at {port}: no such port; {describe_ports()}")
     try:
         tracker = client(settings)
+        tracker.read_version()
         tracker.start_tracking()
     except (OSError, ValueError) as error:
         raise DeviceAbsent(
@@ -183,6 +185,10 @@ def _client_type() -> type[Any]:
         a byte of it is not UTF-8: with three tools, for instance (ndicapi's issue 46)."""
 
         _port: SerialSettings | None = None
+        version = ""  # reply to VER
+
+        def read_version(self) -> None:
+            self.version = str(ndicapy.ndiVER(self._device, 0))
 
         def tx(self) -> str:
             """The reply to TX without its checksum, transforms out of the volume included. Raises OSError."""
@@ -219,6 +225,13 @@ def _client_type() -> type[Any]:
             self._check_for_errors("Sending INIT command")
 
     return TextNDI
+
+
+def described(version: str) -> str:
+    """The device in a reply to VER: firmware and serial number; empty for a reply without them."""
+    fields = dict(line.split(":", 1) for line in version.splitlines() if ":" in line)
+    firmware, serial = fields.get("Freeze Tag", "").strip(), fields.get("NDI S/N", "").strip()
+    return ", ".join([*([firmware] if firmware else []), *([f"serial number {serial}"] if serial else [])])
 
 
 class SerialSettings:

@@ -22,6 +22,8 @@ class Replay:
     """The frames of a recorded run (`run.jsonl`, or its folder), at the pace of the record. `DeviceAbsent` in one line
     for a file that is none, or of a robot with other than `tools` tools."""
 
+    device = "recorded run"
+
     def __init__(
         self,
         path: Path,

@@ -369,6 +369,7 @@ def test_real_client_reads_what_is_shown(tmp_path, firmware, tools):
         shown[1, :3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
         rig.send(poses=shown.tolist())
         source = rig.connect()
+        assert source.device == f"{firmware}, serial number P7-00000"
         frame = read_until(source, lambda frame: frame.valid.all())
         np.testing.assert_allclose(frame.poses, shown, atol=2e-4)
         np.testing.assert_allclose(frame.quality, 0.1)

@@ -47,8 +47,10 @@ def frames_and_errors(source, until, seconds=20.0):
     return frames, errors
 
 
-def test_frames_arrive_whole(opened):
-    frames, errors = frames_and_errors(opened(frames=100), lambda frames, errors: len(frames) == 5)
+def test_frames_and_name_of_the_device_arrive_whole(opened):
+    source = opened(frames=100)
+    frames, errors = frames_and_errors(source, lambda frames, errors: len(frames) == 5)
+    assert source.device == "test tracker"
     assert [frame.device_frame for frame in frames] == [1, 2, 3, 4, 5]
     assert errors == []
     frame = frames[-1]

@@ -108,6 +108,8 @@ def test_changed_character_is_an_error_or_stays_in_its_field(data):
 class Client:
     """Replies to TX, or raises, call by call."""
 
+    version = "Polaris Spectra Control Firmware\nNDI S/N: P7-00123\nFreeze Tag: Polaris Spectra Rev 009\n(C) NDI\n"
+
     def __init__(self, replies):
         self.replies = iter(replies)
 
@@ -154,6 +156,12 @@ def test_any_number_of_wrong_checksums_is_overcome(monkeypatch, tmp_path):
         with pytest.raises(FrameError, match=r"^Error 0x0100: Bad CRC on reply$"):
             source.read()
     assert source.read().device_frame == 6
+
+
+def test_device_is_described_by_its_reply_to_ver(monkeypatch, tmp_path):
+    source, _ = connected(monkeypatch, tmp_path, Client([]))
+    assert source.device == "Polaris Spectra Rev 009, serial number P7-00123"
+    assert ndi.described("OKAY\n:\nFreeze Tag:\n") == ""
 
 
 def test_three_other_errors_in_a_row_lose_the_tracker(monkeypatch, tmp_path):

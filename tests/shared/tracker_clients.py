@@ -15,6 +15,8 @@ from modsoft.runtime.tracking.frame import FrameError, TrackerFrame
 class Client:
     """Returns frames number `first`, first + 1, ...; fails as `then` says after `frames` of them."""
 
+    device = "test tracker"
+
     def __init__(self, folder, frames=5, then="end", first=0):
         self.folder, self.frames, self.then, self.number = Path(folder), frames, then, first
         self.stop_at = first + frames
