@@ -149,6 +149,13 @@ def _has_terminal() -> bool:
     "[tracker] in the robot file]",
 )
 @click.option(
+    "--calibration",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Calibration of the tools, written by modsoft-calibrate. [default: NAME.calibration.toml beside NAME.toml, "
+    "the robot file]",
+)
+@click.option(
     "--runs-dir",
     default="runs",
     show_default=True,

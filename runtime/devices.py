@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import click
@@ -21,6 +21,7 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.dry_run import DryRunBoard
 from modsoft.runtime.board.ports import describe_ports, find_port
+from modsoft.runtime.calibration.use import UsedCalibration, used_by
 from modsoft.runtime.clock import Ticker, spinning
 from modsoft.runtime.control.controller import Control
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ModsoftError, RobotFileError, UsageError
@@ -43,7 +44,8 @@ FIRST_FRAME_WAIT_S = 5.0
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """Options of every command that moves the robot; empty where the robot file decides."""
+    """Options of every command that moves the robot; empty where the robot file decides. `calibration`: None for the
+    file beside the robot file."""
 
     robot: str
     port: str
@@ -52,6 +54,7 @@ class DeviceOptions:
     tools: tuple[Path, ...]
     yes: bool
     dry_run: bool
+    calibration: Path | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -64,10 +67,11 @@ class DeviceSetup:
     port: str  # of the board, empty in a dry run
     tracker_port: str
     tools: list[Path]
+    calibration: UsedCalibration | None = None
 
 
 def read_setup(options: DeviceOptions) -> DeviceSetup:
-    """Reads and checks the robot file; finds the board's port."""
+    """Reads and checks robot file and calibration; finds the board's port."""
     robot, robot_text, folder = _robot(options)
     port = ""
     if not options.dry_run:
@@ -78,14 +82,16 @@ def read_setup(options: DeviceOptions) -> DeviceSetup:
             )
         port = _port(options.port or robot.serial.port)
     tools = list(options.tools) or [folder / tool for tool in robot.tracker.tools]
-    return DeviceSetup(robot, robot_text, folder, port, options.tracker_port or port_of(robot, folder), tools)
+    tracker_port = options.tracker_port or port_of(robot, folder)
+    calibration = used_by(robot, options.robot, tracker_port, tools, options.calibration)
+    return DeviceSetup(robot, robot_text, folder, port, tracker_port, tools, calibration)
 
 
 class Devices:
     """The newest tracker frame, the board, and the request to end.
 
     now, wait: monotonic seconds, and a wait of some seconds, which may return early; by default those of this machine.
-    `board` is None before `open_board`, and in a dry run.
+    `board` is None before `open_board`, and in a dry run. calibration: corrects the frames.
     """
 
     def __init__(
@@ -95,11 +101,13 @@ class Devices:
         board: Board | None = None,
         now: Callable[[], float] = time.monotonic,
         wait: Callable[[float], object] | None = None,
+        calibration: UsedCalibration | None = None,
     ):
         self.robot, self.frames, self.board, self.now = robot, frames, board, now
         self.stop = Stop()
         self.signals = Signals(self.stop, self._leave)
         self._wait = wait
+        self._mounting = None if calibration is None else calibration.mounting
         self._keys = Keys(self.stop)
 
     def _leave(self, code: int) -> None:
@@ -114,6 +122,10 @@ class Devices:
         self.board = Board.open(setup.port, self.robot.serial.baud)
         exits.callback(self.board.close)
 
+    def validator(self) -> FrameValidator:
+        """A new validator of the tracker's frames."""
+        return FrameValidator(self.robot, *([] if self._mounting is None else [self._mounting.corrected]))
+
     def rest(self, validator: FrameValidator, missing: type[ModsoftError] = DeviceAbsent) -> Array:
         """The configuration (N, 3) of the vented robot; waits for the first valid frame of the tracker. Raises
         `missing` without one."""
@@ -122,7 +134,9 @@ class Devices:
             frame = self.frames.latest()
             check = validator.check(frame, self.now())
             if frame is not None and check.configuration is not None:
-                check_rest(check.configuration, frame.poses)
+                check_rest(check.configuration, validator.corrected(frame.poses))
+                if self._mounting is not None:
+                    self._mounting.check_rest(frame.poses)
                 return check.configuration
             if self.frames.error is not None:
                 raise missing(f"tracker: {self.frames.error}")
@@ -176,7 +190,7 @@ class Devices:
         robot, board = self.robot, self.board
         if board is not None:
             board.arm(robot)
-        validator = FrameValidator(robot)  # a new one: the operator may have taken long to confirm
+        validator = self.validator()  # a new one: the operator may have taken long to confirm
         rest = self.rest(validator, missing=LostInRun)
         Loop(
             robot,
@@ -197,22 +211,24 @@ class Devices:
 @contextmanager
 def opened(setup: DeviceSetup) -> Iterator[tuple[Devices, ExitStack]]:
     """The devices with the tracker's frames, and the stack that closes what is opened; signals are requests to end."""
-    devices = Devices(setup.robot, LatestFrame())
+    devices = Devices(setup.robot, LatestFrame(), calibration=setup.calibration)
     with ExitStack() as exits:
         exits.enter_context(devices.signals)
         exits.callback(Reader(open_source(setup.robot, setup.tracker_port, setup.tools), devices.frames).close)
         yield devices, exits
 
 
-def confirm() -> None:
-    """Waits for the operator's Enter, which confirms arming."""
-    click.echo("Chambers at 0 bar? No person near the robot? Press Enter to arm, Ctrl-C to leave. ", err=True, nl=False)
+def confirm(
+    question: str = "Chambers at 0 bar? No person near the robot? Press Enter to arm, Ctrl-C to leave. ",
+) -> None:
+    """Waits for the operator's Enter, by default as the confirmation of arming."""
+    click.echo(question, err=True, nl=False)
     try:
         line = sys.stdin.readline()
     except (OSError, ValueError):
         line = ""
     if not line:
-        raise UsageError("arming needs Enter, and standard input is closed; give --yes")
+        raise UsageError("found standard input closed, expected Enter; give --yes")
 
 
 def _robot(options: DeviceOptions) -> tuple[Robot, str, Path]:

@@ -1,4 +1,5 @@
-"""Writes the run log: `runs/<utc>-<name>/` with `run.jsonl`, `meta.json` and the robot file that was used.
+"""Writes the run log: `runs/<utc>-<name>/` with `run.jsonl`, `meta.json`, and the robot file and the calibration that
+were used.
 
 `run.jsonl` has one record a line (`log_record.py` documents every field). A thread of its own writes and flushes each
 record at once, so that the loop never waits for a disk and a killed process loses nothing.
@@ -80,18 +81,30 @@ class Writer:
 class RunLog:
     """The log of one run. `put` adds a record at any time, `close` the outcome.
 
-    meta.json holds what the caller passes (the session: command, robot, task, steps, correction, model, board, port),
-    and `schema`, `started` and `ended` (UTC), `versions`, `host`, `exit_code` and `reason` (null while the run lasts),
-    `lines_lost`, `log_error`, `figures` (of `TickStatistics`), `tracker` and `connection` (counts), `vented`.
+    meta.json holds what the caller passes (the session: command, robot, task, steps, correction, model, board, port,
+    calibration), and `schema`, `started` and `ended` (UTC), `versions`, `host`, `exit_code` and `reason` (null while
+    the run lasts), `lines_lost`, `log_error`, `figures` (of `TickStatistics`), `tracker` and `connection` (counts),
+    `vented`.
     """
 
-    def __init__(self, runs: Path, name: str, robot_text: str, meta: dict[str, Any], now: datetime | None = None):
+    def __init__(
+        self,
+        runs: Path,
+        name: str,
+        robot_text: str,
+        meta: dict[str, Any],
+        now: datetime | None = None,
+        calibration: str | None = None,
+    ):
         """`runs`: where the folder is made; `name`: of the robot; `robot_text`: the robot file; `meta`: robot, model,
-        task and so on. Raises `UsageError` where nothing can be written."""
+        task and so on; `calibration`: text of the calibration file in use. Raises `UsageError` where nothing can be
+        written."""
         now = now or datetime.now(UTC)
         try:
             self.folder = _new_folder(runs, f"{now:%Y%m%dT%H%M%SZ}-{name}")
             (self.folder / "robot.toml").write_text(robot_text, encoding="utf-8")
+            if calibration is not None:
+                (self.folder / "calibration.toml").write_text(calibration, encoding="utf-8")
             self._meta = {"schema": SCHEMA, "started": now.isoformat(), **meta, "versions": versions(), "host": host()}
             self._write_meta({"exit_code": None, "reason": None})
             self._writer = Writer(self.folder / "run.jsonl")

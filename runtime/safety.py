@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -60,7 +61,7 @@ class FrameCheck(NamedTuple):
 
 
 class FrameValidator:
-    """Checks the newest frame at every tick, against the last good one among others.
+    """Checks the newest frame at every tick. corrected: poses (N + 1, 4, 4) of the ends from those of the tools.
 
     The gate on jumps: over the whole range of the actuation a module bends through half a turn at most, twice that for
     the swing, so in one period it moves by 180 degrees times the largest actuation step at most. Without a valid frame
@@ -68,8 +69,9 @@ class FrameValidator:
     `CONFIRMING_FRAMES` more valid frames in a row, each within the gate of the one before.
     """
 
-    def __init__(self, robot: Robot):
+    def __init__(self, robot: Robot, corrected: Callable[[Array], Array] = lambda poses: poses):
         self.robot = robot
+        self.corrected = corrected
         self._deg_per_s = 180.0 * robot.limits.largest_actuation_step / robot.loop.period_s
         self._used: TrackerFrame | None = None
         self._used_configuration: Array | None = None
@@ -92,7 +94,7 @@ class FrameValidator:
         if status != GOOD:
             return FrameCheck(status, None, age_s, detail)
         if self._rest_mm is None:
-            self._rest_mm = _lengths_mm(frame)
+            self._rest_mm = _lengths_mm(self.corrected(frame.poses))
         self._used, self._used_configuration = frame, configuration
         return FrameCheck(GOOD, configuration, age_s)
 
@@ -124,28 +126,35 @@ class FrameValidator:
                 self._prompt.popleft()
         return max(0.0, delay_s)
 
-    def content(self, frame: TrackerFrame) -> tuple[str, str, Array | None]:
-        """The status of the poses, its detail, and the configuration (N, 3) if the status is good. Keeps nothing."""
-        count = self.robot.modules + 1
+    def measured(self, frame: TrackerFrame) -> tuple[str, str]:
+        """Whether the device measured every tool, wherever it is: the status, and its detail. Keeps nothing."""
+        count, limit_mm = self.robot.modules + 1, self.robot.limits.largest_rms_mm
         if frame.poses.shape != (count, 4, 4) or len(frame.valid) != count:
-            return WRONG_NUMBER, f"{len(frame.poses)}, expected {count}", None
+            return WRONG_NUMBER, f"{len(frame.poses)}, expected {count}"
         if not frame.valid.all():
-            return HIDDEN, _tool_name(int(np.argmin(frame.valid))), None
+            return HIDDEN, _tool_name(int(np.argmin(frame.valid)))
         if frame.port_status is not None:
             for tool, port_status in enumerate(frame.port_status):
                 refused = port_status & self.robot.limits.refused_port_status
                 if refused & PORT_OUT_OF_VOLUME:
-                    return OUT_OF_VOLUME, _tool_name(tool), None
+                    return OUT_OF_VOLUME, _tool_name(tool)
                 if refused or port_status & PORT_IN_USE != PORT_IN_USE:
-                    causes = [name for bit, name in PORT_ERRORS.items() if refused & bit]
-                    return PORT_ERROR, ", ".join([f"{_tool_name(tool)} {port_status:#x}", *causes]), None
-        if (frame.quality > self.robot.limits.largest_rms_mm).any():  # NaN: not measured
+                    causes = (name for bit, name in PORT_ERRORS.items() if refused & bit)
+                    return PORT_ERROR, ", ".join([f"{_tool_name(tool)} {port_status:#x}", *causes])
+        if (frame.quality > limit_mm).any():  # NaN: not measured
             worst = int(np.nanargmax(frame.quality))
-            limit_mm = self.robot.limits.largest_rms_mm
-            return INACCURATE, f"{_tool_name(worst)} {frame.quality[worst]:.2f} mm, at most {limit_mm:g} mm", None
+            return INACCURATE, f"{_tool_name(worst)} {frame.quality[worst]:.2f} mm, at most {limit_mm:g} mm"
         if not np.isfinite(frame.poses).all():
-            return NOT_FINITE, _tool_name(int(np.argmin(np.isfinite(frame.poses).all(axis=(1, 2))))), None
-        configuration = from_poses(frame.poses)
+            return NOT_FINITE, _tool_name(int(np.argmin(np.isfinite(frame.poses).all(axis=(1, 2)))))
+        return GOOD, ""
+
+    def content(self, frame: TrackerFrame) -> tuple[str, str, Array | None]:
+        """The status of the poses, its detail, and the configuration (N, 3) if the status is good. Keeps nothing."""
+        status, detail = self.measured(frame)
+        if status != GOOD:
+            return status, detail, None
+        poses = self.corrected(frame.poses)
+        configuration = from_poses(poses)
         # Numbers of Python: for a few modules they take a tenth of the time of arrays.
         off = [abs(math.hypot(*tangent) - 1.0) for tangent in configuration.tolist()]
         if not all(each <= SIZE_TOLERANCE for each in off):  # nor where numbers too large give none
@@ -153,12 +162,12 @@ class FrameValidator:
         if self.robot.motion == "planar" and (detail := _out_of_plane(configuration)):
             return OUT_OF_PLANE, detail, None
         if self._rest_mm is not None:
-            pairs = zip(_lengths_mm(frame), self._rest_mm, strict=True)
+            pairs = zip(_lengths_mm(poses), self._rest_mm, strict=True)
             over = [length - (STRETCH * rest + STRETCH_MM) for length, rest in pairs]
             if max(over) > 0:
                 worst = int(np.argmax(over))
                 return SWAPPED, f"{_tool_name(worst)} and {_tool_name(worst + 1)}", None
-            pairs = zip(_ahead_mm(frame.poses), self._rest_mm[1:], strict=True)
+            pairs = zip(_ahead_mm(poses), self._rest_mm[1:], strict=True)
             behind = [-ahead > BEHIND * rest for ahead, rest in pairs]
             if any(behind):  # tools in the order from tip to base have the same distances
                 first = behind.index(True) + 1
@@ -286,6 +295,6 @@ def _ahead_mm(poses: Array) -> list[float]:
     ]
 
 
-def _lengths_mm(frame: TrackerFrame) -> list[float]:
+def _lengths_mm(poses: Array) -> list[float]:
     """Distances from each tool to the next, mm: N."""
-    return [math.dist(*pair) for pair in pairwise(frame.poses[:, :3, 3].tolist())]
+    return [math.dist(*pair) for pair in pairwise(poses[:, :3, 3].tolist())]

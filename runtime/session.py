@@ -16,6 +16,7 @@ import msgspec
 
 from modsoft.runtime import devices
 from modsoft.runtime.arrays import Array
+from modsoft.runtime.calibration.use import NONE_IN_USE
 from modsoft.runtime.control import correction
 from modsoft.runtime.control.controller import Controller
 from modsoft.runtime.control.features import bending_angle_deg
@@ -25,7 +26,6 @@ from modsoft.runtime.devices import DeviceOptions, DeviceSetup
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.log import RunLog
 from modsoft.runtime.robot import Robot
-from modsoft.runtime.safety import FrameValidator
 from modsoft.runtime.statistics import TickStatistics
 from modsoft.runtime.terminal import say
 
@@ -57,6 +57,7 @@ class Setup:
         """For the log."""
         description = msgspec.to_builtins(self.model.description)
         description.pop("golden", None)
+        calibration = self.devices.calibration
         return {
             "command": sys.argv[1:],
             "robot": self.devices.robot.to_dict(),
@@ -65,6 +66,7 @@ class Setup:
             "correction": self.options.correction,
             "model": {"file": str(self.options.model), "sha256": self.model_sha256, "description": description},
             "port": self.devices.port or None,
+            "calibration": None if calibration is None else str(calibration),
         }
 
 
@@ -75,7 +77,7 @@ def run(options: Options) -> None:
     setup = _setup(options)
     robot = setup.devices.robot
     with devices.opened(setup.devices) as (rig, exits):
-        rest = rig.rest(FrameValidator(robot))
+        rest = rig.rest(rig.validator())
         setup.model.warm_up(robot.modules)
         _describe(setup, rest)
         if not options.dry_run:
@@ -85,7 +87,9 @@ def run(options: Options) -> None:
             devices.confirm()
         rig.signals.hold()  # from here on there is a log to be closed
         meta = {**setup.meta, "board": None if rig.board is None else rig.board.hello._asdict()}
-        log = RunLog(options.runs, robot.name, setup.devices.robot_text, meta)
+        used = setup.devices.calibration
+        calibration = None if used is None else used.text
+        log = RunLog(options.runs, robot.name, setup.devices.robot_text, meta, calibration=calibration)
         method = correction.by_name(options.correction, robot.modules)
         rig.drive(
             lambda rest: Controller(robot, setup.model, rest, method),
@@ -110,6 +114,7 @@ def _describe(setup: Setup, rest: Array) -> None:
     robot, steps = setup.devices.robot, len(setup.desired)
     angles = ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in bending_angle_deg(rest))  # not -0.0
     say(f"robot {robot.name}, {robot.modules} modules, hangs at {angles} degrees")
+    say(str(setup.devices.calibration or NONE_IN_USE))
     say(f"model {setup.options.model}, task {setup.task}: {steps} steps, {steps * robot.loop.period_s:.0f} s")
     say(f"correction {setup.options.correction}")
 

@@ -2,9 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import click
 
 from modsoft.runtime.entry_point import entry
+
+OPTIONS = (
+    click.option(
+        "--robot", default="robot.toml", show_default=True, metavar="FILE|NAME", help="Robot file, or a shipped robot."
+    ),
+    click.option(
+        "--tracker-port",
+        default="",
+        metavar="PORT",
+        help="Serial port of the tracker (vega: its address). [default: port under [tracker] in the robot file]",
+    ),
+    click.option(
+        "--tool",
+        "tools",
+        multiple=True,
+        metavar="FILE",
+        type=click.Path(path_type=Path),
+        help="Tool definition file, once for each tool: base, then module 1 to N. [default: tools under [tracker] in "
+        "the robot file]",
+    ),
+    click.option(
+        "--calibration",
+        metavar="FILE",
+        type=click.Path(path_type=Path),
+        help="Calibration file to write. [default: NAME.calibration.toml beside NAME.toml, the robot file]",
+    ),
+    click.option(
+        "--picture",
+        metavar="FILE",
+        type=click.Path(path_type=Path),
+        help="Picture of the result to write, with matplotlib. [default: the calibration file, ending in .png]",
+    ),
+    click.option(
+        "--frames", default=100, show_default=True, metavar="N", type=click.IntRange(20), help="Frames to average."
+    ),
+    click.option("--yes", is_flag=True, help="Measure without asking."),
+)
+
+
+def tool_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The options of commands that measure the tools."""
+    for option in reversed(OPTIONS):
+        function = option(function)
+    return function
 
 
 @click.group("modsoft-calibrate", context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
@@ -15,6 +63,37 @@ def cli() -> None:
     The results are beside the robot file, in robot.calibration.toml; modsoft-runtime uses them. The file before is kept
     as robot.calibration.toml.backup.
     """
+
+
+@cli.command()
+@tool_options
+@click.option(
+    "--module",
+    "only",
+    multiple=True,
+    type=click.IntRange(1),
+    metavar="K",
+    help="Calibrate only this module, which was added or whose tool was moved; may be repeated. [default: all]",
+)
+def rest(only: tuple[int, ...], **options: Any) -> None:
+    """Measure how the tools are mounted: vented robot, hanging straight.
+
+    In a straight robot the ends of all modules have the rotation of the base, and are at equal distances on a line
+    along its z axis. What the tracker sees instead is how the tools are mounted; modsoft-runtime corrects every frame
+    for it. The axes of the base's tool are those of the robot: z from base to tip, x in the plane of a planar robot.
+    """
+    from modsoft.runtime.calibration.commands import Options, calibrate_rest  # --help does without numpy
+
+    calibrate_rest(Options(**options), only)
+
+
+@cli.command()
+@tool_options
+def noise(**options: Any) -> None:
+    """Measure the noise of the tools at rest, and what it costs."""
+    from modsoft.runtime.calibration.commands import Options, measure_noise
+
+    measure_noise(Options(**options))
 
 
 main = entry(cli)

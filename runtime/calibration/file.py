@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -30,6 +30,8 @@ COMMENT = """\
 # of a fifth of the frames from the mean of all.
 
 """
+
+FIRST = ("module", "rotation_deg", "position_mm")  # keys of an entry, in the file
 
 Date = Annotated[str, Meta(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ$")]  # UTC
 Degrees = Annotated[float, Meta(ge=-360.0, le=360.0)]
@@ -144,8 +146,9 @@ def text_of(calibration: Calibration) -> str:
 
 
 def _pairs(table: dict[str, Any]) -> list[str]:
-    """Lines of TOML for text and numbers, which it writes as JSON does."""
-    return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items()]
+    """Lines of TOML for text and numbers, which it writes as JSON does; the mounting first."""
+    keys = sorted(table, key=lambda key: key not in FIRST)
+    return [f"{key} = {json.dumps(table[key], ensure_ascii=False)}" for key in keys]
 
 
 def now() -> str:
@@ -161,11 +164,17 @@ def sha256_of(tool_files: Sequence[Path]) -> list[str]:
         raise ModelError(f"{error.filename}: cannot be read ({error.strerror or error})") from error
 
 
-def check(calibration: Calibration, robot: Robot, tools: Sequence[str] | None, where: str | Path) -> None:
+def check(
+    calibration: Calibration,
+    robot: Robot,
+    tools: Sequence[str] | None,
+    where: str | Path,
+    without: Collection[int] = (),
+) -> None:
     """Raises `ModelError` for the calibration of another robot, of too few modules, or of other tools.
 
     tools: SHA-256 of the tool definition files, base first; None where they are not known (a recorded run). `where`:
-    name of the calibration file.
+    name of the calibration file. without: modules whose entries are not used.
     """
     if calibration.robot != robot.name:
         raise ModelError(
@@ -173,7 +182,7 @@ def check(calibration: Calibration, robot: Robot, tools: Sequence[str] | None, w
             "modsoft-calibrate rest, or give another --calibration FILE"
         )
     count = len(calibration.modules)
-    if count < robot.modules:
+    if any(number not in without for number in range(count + 1, robot.modules + 1)):
         missing = f"rest --module {robot.modules}" if count and count + 1 == robot.modules else "rest"
         raise ModelError(
             f"{where}: found the calibration of {count} modules, expected {robot.modules}; run modsoft-calibrate "
@@ -181,7 +190,7 @@ def check(calibration: Calibration, robot: Robot, tools: Sequence[str] | None, w
         )
     entries: tuple[Tool, ...] = (calibration.base, *calibration.modules)
     for place, (entry, sha256) in enumerate(zip(entries, tools or (), strict=False)):
-        if entry.tool_sha256 != sha256:
+        if entry.tool_sha256 != sha256 and place not in without:
             name, again = ("base", "") if place == 0 else (f"module {place}", f" --module {place}")
             raise ModelError(
                 f"{where}: found another tool definition file for the {name} than at its calibration on {entry.date} "

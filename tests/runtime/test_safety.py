@@ -28,6 +28,20 @@ def settled(start_s=100.0):
     return validator
 
 
+def test_every_check_of_poses_is_of_corrected_ones():
+    """The tool of module 1 is beside that of the base, and turned; corrected, the robot is as it was at rest."""
+    mounting = np.tile(np.eye(4), (4, 1, 1))
+    mounting[1] = [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, -80.0], [0.0, 0.0, 0.0, 1.0]]
+    mounting[3, 2, 3] = -120.0  # behind that of module 2
+    validator = FrameValidator(ROBOT, lambda poses: poses @ np.linalg.inv(mounting))
+    for number, angles in ((1, (0.0, 0.0, 0.0)), (2, (3.0, 30.0, -40.0))):
+        check = validator.check(
+            frame(60 * number, 100.0 + number, poses=planar_poses(angles) @ mounting), 100.02 + number
+        )
+        assert check.good
+        np.testing.assert_allclose(bending_angle_deg(check.configuration), angles, atol=1e-9)
+
+
 def test_good_frame_gives_its_configuration():
     check = FrameValidator(ROBOT).check(frame(1, 100.0, (3.0, 30.0, -40.0)), 100.02)
     assert check.good

@@ -9,13 +9,13 @@ import numpy as np
 
 from modsoft.hil.stepped import SteppedRig
 from modsoft.runtime.arrays import Array
+from modsoft.runtime.calibration.use import UsedCalibration
 from modsoft.runtime.clock import Ticker
 from modsoft.runtime.control.controller import Control
 from modsoft.runtime.devices import Devices
 from modsoft.runtime.errors import LostInRun
 from modsoft.runtime.log_record import Record, TickRecord
 from modsoft.runtime.loop import Loop
-from modsoft.runtime.safety import FrameValidator
 from modsoft.runtime.statistics import TickStatistics
 
 
@@ -29,8 +29,14 @@ class Motion(NamedTuple):
     positions: Array  # (K + 1, N, 3) module ends in the frame of the base, m
 
 
-def run(rig: SteppedRig, control: Callable[[Array], Control], desired: Array) -> Motion:
-    """Arms the board, runs the loop for the steps of `desired` (K, N, 3) and vents. control: see `Loop`.
+def run(
+    rig: SteppedRig,
+    control: Callable[[Array], Control],
+    desired: Array,
+    calibration: UsedCalibration | None = None,
+) -> Motion:
+    """Arms the board, runs the loop for the steps of `desired` (K, N, 3) and vents. control: see `Loop`; calibration:
+    of the tracker's tools.
 
     Raises what ends the loop earlier, and `LostInRun` where the board does not confirm the venting.
     """
@@ -43,9 +49,9 @@ def run(rig: SteppedRig, control: Callable[[Array], Control], desired: Array) ->
             true_configuration.append(np.array(arm.configuration))
             positions.append(np.array(arm.positions))
 
-    devices = Devices(robot, rig.frames, rig.board, rig.clock, rig.wait)
+    devices = Devices(robot, rig.frames, rig.board, rig.clock, rig.wait, calibration)
     rig.board.arm(robot)
-    validator = FrameValidator(robot)
+    validator = devices.validator()
     rest = devices.rest(validator, missing=LostInRun)
     ticker = Ticker(robot.loop.period_s, rig.clock, rig.wait)
     statistics = TickStatistics(robot, len(desired))

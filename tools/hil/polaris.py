@@ -46,6 +46,7 @@ from typing import Any
 import click
 
 from modsoft.hil.polaris_device import FRAME_HZ, Polaris
+from modsoft.hil.tool_errors import NO_ERRORS, ToolErrors
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import UsageError
 
@@ -204,14 +205,29 @@ def write_tool_files(folder: Path, tools: int) -> list[Path]:
 @click.option("--wired", default=0, help="Tools that are wired to it: aurora.")
 @click.option("--frame-hz", type=float, help="Frame rate.  [default: 60; aurora: 40]")
 @click.option("--unpaced", is_flag=True, help="Answer at once, not in the time of a serial line.")
-def cli(link: Path, firmware: str, kind: str, wired: int, frame_hz: float | None, unpaced: bool) -> None:
+@click.option(
+    "--errors",
+    default=tuple(NO_ERRORS),
+    type=(float, float, float, float, int),
+    metavar="DEG MM DEG MM SEED",
+    help="Largest mounting errors of the tools, standard deviations of their noise, and a seed.",
+)
+def cli(
+    link: Path,
+    firmware: str,
+    kind: str,
+    wired: int,
+    frame_hz: float | None,
+    unpaced: bool,
+    errors: tuple[float, float, float, float, int],
+) -> None:
     """A fake optical tracker (started by modsoft-hil)."""
 
     def say(event: dict[str, Any]) -> None:
         sys.stdout.write(json.dumps(event) + "\n")
         sys.stdout.flush()
 
-    device = Polaris(firmware=firmware, kind=kind, wired=wired, frame_hz=frame_hz)
+    device = Polaris(firmware=firmware, kind=kind, wired=wired, frame_hz=frame_hz, errors=ToolErrors(*errors))
     line = Network() if kind == "vega" else Pty(link, 0.0 if unpaced else SECONDS_A_BYTE)
     try:
         say({"event": "ready", "port": line.address})

@@ -17,6 +17,7 @@ from typing import Any
 
 from modsoft.hil.byte_damage import ByteDamage
 from modsoft.hil.rotations import Pose, quaternion, seen_from, turn, turned, without_roll
+from modsoft.hil.tool_errors import NO_ERRORS, ToolErrors
 
 FRAME_HZ = {"polaris": 60.0, "vega": 60.0, "aurora": 40.0}  # as in NDI's API guides
 AURORA_TURN = (0.9, 0.2, 0.25, 0.3)  # quaternion of the field generator, in any position: each tool has some roll
@@ -69,11 +70,12 @@ class Polaris:
         kind: str = "polaris",
         wired: int = 0,
         frame_hz: float | None = None,
+        errors: ToolErrors = NO_ERRORS,
     ):
         """`firmware`: with "Rev 007" at its end the client requests TX instead of BX. `kind`: as in the robot file;
         `wired`: number of tools that need no definition file; `frame_hz`: of the frame numbers, if not that of the
-        kind."""
-        self.now = now
+        kind; `errors`: mounting errors and noise of the tools."""
+        self.now, self._errors = now, errors
         self._frame_hz = frame_hz or FRAME_HZ[kind]
         self._turn = turn(AURORA_TURN) if kind == "aurora" else None
         self._wired = {FIRST_HANDLE + tool: "written" for tool in range(wired)}
@@ -228,7 +230,8 @@ class Polaris:
             poses = sample
             if sampled_s <= at_s:
                 break
-        return max(0, int((at_s - self._started_s) * self._frame_hz) - self.faults.get("back", 0)), poses
+        number = max(0, int((at_s - self._started_s) * self._frame_hz) - self.faults.get("back", 0))
+        return number, self._errors.measured(number, poses)
 
     def _tx(self, rows: list[tuple[int, Pose | None, int]]) -> str:
         text = f"{len(rows):02X}"

@@ -58,3 +58,15 @@ def without_roll(q: tuple[float, float, float, float]) -> tuple[float, float, fl
         return 0.0, x, y, 0.0
     w, x, y = size, (x * w - y * z) / size, (y * w + x * z) / size
     return w, x, y, 0.0
+
+
+def after(pose: Pose, rotation: Pose, mm: Sequence[float]) -> Pose:
+    """A pose moved by `mm` and then turned by `rotation` (3, 3), both in its own frame."""
+    rows = [
+        [
+            *(sum(row[k] * rotation[k][j] for k in range(3)) for j in range(3)),
+            row[3] + sum(row[k] * mm[k] for k in range(3)),
+        ]
+        for row in pose[:3]
+    ]
+    return [*rows, [0.0, 0.0, 0.0, 1.0]]
