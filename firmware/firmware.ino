@@ -12,7 +12,8 @@
 #include "pwm.h"
 #include "sensors.h"
 
-#define BYTES_PER_PASS 8  // in each direction; every byte starts a pass
+#define RX_BYTES_PER_PASS 32  // arrive in 1.3 ms, about the longest pass; the receive buffer holds 63
+#define TX_BYTES_PER_PASS 8
 
 static struct supervisor board;
 static struct sensors inputs;
@@ -42,7 +43,7 @@ void loop() {
   const uint32_t now_ms = millis();
 
   // At most one frame and a few bytes in a pass, so that a flood of bytes cannot delay the checks.
-  for (uint8_t i = 0; i < BYTES_PER_PASS && Serial.available() > 0; i++) {
+  for (uint8_t i = 0; i < RX_BYTES_PER_PASS && Serial.available() > 0; i++) {
     if (supervisor_receive(&board, (uint8_t)Serial.read(), now_ms)) {
       break;  // the next interrupt starts the pass that takes the rest
     }
@@ -57,7 +58,7 @@ void loop() {
     }
   }
   // Never waits for the host to read. A few bytes at a time, because every byte sent starts a pass that adds more.
-  for (uint8_t i = 0; i < BYTES_PER_PASS && Serial.availableForWrite() > 0; i++) {
+  for (uint8_t i = 0; i < TX_BYTES_PER_PASS && Serial.availableForWrite() > 0; i++) {
     const int16_t next = supervisor_next_byte(&board);
     if (next < 0) {
       break;

@@ -9,6 +9,8 @@ import pytest
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.hil.board.stepped_port import SteppedPort
 from modsoft.runtime.board.board import Board
+from modsoft.runtime.board.codec import Parser, encode
+from modsoft.runtime.board.protocol import Arm, Status
 
 
 def hello_at_s(port: SteppedPort) -> float:
@@ -51,3 +53,21 @@ def test_written_bytes_arrive_in_the_next_step(board_name: str) -> None:
         assert port.in_waiting > 0
         port.close()
     assert board.summary["rx"] == 200
+
+
+@pytest.mark.usefixtures("simavr")
+def test_no_byte_is_lost_at_the_rate_of_the_line() -> None:
+    """Each frame is answered, so the firmware receives and sends at once. 63 bytes have room in its receive buffer."""
+    frames, blocks = 16, 16
+    with EmulatedBoard("simavr", bootloader=False, stepped=True) as board:
+        port = SteppedPort(board)
+        port.idle(0.2)
+        for _ in range(blocks):
+            port.write(frames * encode(Arm(0, 0, 1, 0, 0)))  # refused
+            port.idle(frames * len(encode(Arm(0, 0, 1, 0, 0))) * 40e-6)
+            port.read(port.in_waiting)
+        port.idle(0.1)
+        replies = Parser().feed(port.read(port.in_waiting))
+        counts = [reply.message for reply in replies if isinstance(reply.message, Status)][-1]
+        port.close()
+    assert (counts.rx_good, counts.rx_bad, counts.rx_refused) == (frames * blocks, 0, frames * blocks)

@@ -101,7 +101,7 @@ def test_rows_01_to_04_on_the_emulated_board(matrix_row, full, row, kind, fault,
             host.send_repeated(tries)
         else:
             host.send(kind, tries)
-        result = host.result()
+        result, counts = host.result(), host.counts()
     matrix_row(
         row,
         fault=f"{fault}, emulated",
@@ -110,4 +110,4 @@ def test_rows_01_to_04_on_the_emulated_board(matrix_row, full, row, kind, fault,
         worst=f"{result['accepted']} frames too many or too few accepted, {len(result['events'])} changes of valves",
         clock="none",
     )
-    assert result == {"accepted": 0, "refused": 0, "events": [], "state": State.RUNNING}
+    assert result == {"accepted": 0, "refused": 0, "events": [], "state": State.RUNNING}, counts

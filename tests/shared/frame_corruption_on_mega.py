@@ -5,7 +5,7 @@ import time
 
 import serial
 
-from modsoft.hil.board.emulator import EmulatedBoard
+from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.runtime.board import protocol
 from modsoft.runtime.board.codec import Parser, encode
 from modsoft.runtime.board.protocol import Arm, ClearFault, Heartbeat, Hello, HelloReq, Set, State, Status, Vent
@@ -164,13 +164,20 @@ class FrameCorruption:
     def result(self):
         """accepted, refused: counts minus the expected ones; events: of valves and resets; state."""
         self.parser = Parser()
-        status = self.status()
+        self.final = status = self.status()
         return {
             "accepted": self.difference(status.rx_good - self.base.rx_good, self.valid_count - self.base_valid_count),
             "refused": self.difference(status.rx_refused - self.base.rx_refused, self.refused_count),
             "events": [e for e in self.emulated.trace[self.since :] if e["event"] in ("pwm", "reset", "watchdog")],
             "state": State(status.state),
         }
+
+    def counts(self):
+        """For the message of a failed test."""
+        self.emulated.send("stats")
+        statistics = self.emulated.wait_for(is_event("stats"), TIMEOUT_S, self.since)
+        late = [event for event in self.emulated.trace[self.since :] if event["event"] == "late"]
+        return f"before: {self.base}; after: {self.final}; {self.valid_count} valid sent; {statistics}; late: {late}"
 
     @staticmethod
     def difference(counted, expected):
