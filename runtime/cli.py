@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from modsoft.runtime import robot as robot_file
 from modsoft.runtime.choices import CORRECTIONS
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import RobotFileError, UsageError
+from modsoft.runtime.terminal import has_terminal
 
 
 def _print_ports() -> None:
@@ -82,14 +82,6 @@ def _without_run(list_ports: bool, check: str | None, print_robot: str | None) -
     if print_robot is not None:
         click.echo(robot_file.text_of(print_robot), nl=False)
     return any(given)
-
-
-def _has_terminal() -> bool:
-    """Whether an operator can press Enter."""
-    try:
-        return sys.stdin is not None and sys.stdin.isatty()
-    except ValueError:  # closed
-        return False
 
 
 @click.command("modsoft-runtime", context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
@@ -200,7 +192,7 @@ def cli(**options: Any) -> None:
     """
     if _without_run(options.pop("list_ports"), options.pop("check"), options.pop("print_robot")):
         return
-    if not options["yes"] and not options["dry_run"] and not _has_terminal():
+    if not options["yes"] and not options["dry_run"] and not has_terminal():
         raise UsageError("arming asks for Enter, and there is no terminal to press it at; give --yes, or --dry-run")
     from modsoft.runtime.session import Options, run  # --help does without numpy and onnxruntime
 

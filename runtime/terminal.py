@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import threading
 from collections.abc import Callable
 from types import TracebackType
@@ -20,6 +21,14 @@ def say(text: str) -> None:
         click.echo(text, err=True)
     except (OSError, ValueError):
         pass
+
+
+def has_terminal() -> bool:
+    """Whether an operator can press Enter."""
+    try:
+        return sys.stdin is not None and sys.stdin.isatty()
+    except ValueError:  # closed
+        return False
 
 
 class TerminalThread:

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from modsoft.runtime.calibration import board_cli
 from modsoft.runtime.entry_point import entry
 
 OPTIONS = (
@@ -60,8 +61,8 @@ def tool_options(function: Callable[..., Any]) -> Callable[..., Any]:
 def cli() -> None:
     """Measure a robot before its first run.
 
-    The results are beside the robot file, in robot.calibration.toml; modsoft-runtime uses them. The file before is kept
-    as robot.calibration.toml.backup.
+    Results about the tools are beside the robot file, in robot.calibration.toml, those about hoses and valves in the
+    robot file; modsoft-runtime uses both. The file before is kept with the ending .backup.
     """
 
 
@@ -96,6 +97,8 @@ def noise(**options: Any) -> None:
     measure_noise(Options(**options))
 
 
+cli.add_command(board_cli.channels)
+cli.add_command(board_cli.valves)
 main = entry(cli)
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """A simulated arm in closed form, for tests: chambers in any directions, fast, and as stiff as a real one."""
 
+import math
+
 import numpy as np
 
 from modsoft.runtime.control.features import from_directors
@@ -19,6 +21,7 @@ class BendingArm:
         self._lag_s, self._coupling = lag_s, coupling
         self.set_bar = np.zeros((modules, len(directions_deg)))
         self.pressures = self.set_bar.copy()
+        self.advance(0.0)
 
     def set_pressures(self, bar):
         self.set_bar = np.array(bar)
@@ -26,10 +29,9 @@ class BendingArm:
     def advance(self, duration_s):
         left = np.exp(-duration_s / self._lag_s) if self._lag_s else 0.0
         self.pressures = self.set_bar + (self.pressures - self.set_bar) * left
+        self.directors = self._directors()  # (N, 3, 3), rows d1, d2, d3
 
-    @property
-    def directors(self):
-        """(N, 3, 3), rows d1, d2, d3."""
+    def _directors(self):
         bends = np.radians(self._deg_per_bar)[:, None] * (self.pressures @ self._away)  # (N, 2)
         beside = np.zeros_like(bends)
         beside[1:] += bends[:-1]
@@ -53,7 +55,8 @@ class BendingArm:
 
 def rotation(vector):
     """Rotation matrix (3, 3) of a rotation vector, rad."""
-    angle = np.linalg.norm(vector)
-    x, y, z = vector / angle if angle else np.zeros(3)
+    x, y, z = vector
+    angle = math.sqrt(x * x + y * y + z * z)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    first, second = (math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2) if angle else (1.0, 0.5)
+    return np.eye(3) + first * cross + second * (cross @ cross)
