@@ -17,10 +17,10 @@ from modsoft.runtime.terminal import has_terminal
 def _print_ports() -> None:
     from modsoft.runtime.board.ports import list_ports  # --help does without pyserial
 
-    found = list_ports()
-    for port in found:
+    ports = list_ports()
+    for port in ports:
         click.echo(port)
-    if not found:
+    if not ports:
         click.echo("no serial port on this machine; is the board plugged in?", err=True)
 
 
@@ -53,27 +53,27 @@ def _check_robot(name: str) -> None:
 
 def _open_ends(robot: robot_file.Robot, beside: Path) -> list[str]:
     """What a valid robot file leaves to the command line, in words. Its paths start from the folder `beside`."""
-    found = [] if robot.loop.task else ["task under [loop], or --task"]
+    missing = [] if robot.loop.task else ["task under [loop], or --task"]
     if robot.valve is None:
-        return found  # simulated: there is nothing to connect
+        return missing  # simulated: there is nothing to connect
     tracker = robot.tracker
     if not tracker.port:
-        found.append("port under [tracker], or --tracker-port")
+        missing.append("port under [tracker], or --tracker-port")
     elif tracker.source == "replay" and not (beside / tracker.port).exists():
-        found.append(f"{beside / tracker.port}, which is not there")
+        missing.append(f"{beside / tracker.port}, which is not there")
     if tracker.source == "ndi" and tracker.type != "aurora":  # aurora's tools are wired
         if not tracker.tools:
-            found.append("tools under [tracker], or --tool")
-        found += [f"{beside / tool}, which is not there" for tool in tracker.tools if not (beside / tool).is_file()]
+            missing.append("tools under [tracker], or --tool")
+        missing += [f"{beside / tool}, which is not there" for tool in tracker.tools if not (beside / tool).is_file()]
     if not robot.serial.port:
-        found.append("port under [serial], or --port")
-    return found
+        missing.append("port under [serial], or --port")
+    return missing
 
 
 def _without_run(list_ports: bool, check: str | None, print_robot: str | None) -> bool:
     """Handles the options that start no run. Returns whether one was given."""
-    given = [list_ports, check is not None, print_robot is not None]
-    if sum(given) > 1:
+    options = [list_ports, check is not None, print_robot is not None]
+    if sum(options) > 1:
         raise UsageError("--list-ports, --check and --print-robot do one thing each and leave; give one of them")
     if list_ports:
         _print_ports()
@@ -81,7 +81,7 @@ def _without_run(list_ports: bool, check: str | None, print_robot: str | None) -
         _check_robot(check)
     if print_robot is not None:
         click.echo(robot_file.text_of(print_robot), nl=False)
-    return any(given)
+    return any(options)
 
 
 @click.command("modsoft-runtime", context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})

@@ -77,7 +77,7 @@ class Loop:
     def run(self, rest: Array) -> None:
         """Runs the whole task from `rest` (N, 3), the configuration of the vented robot; the board is armed.
 
-        Returns one period after the last step. Whatever ends the task earlier is raised; the caller vents.
+        Returns one period after the last step. What ends the task earlier is raised; the caller vents.
         """
         controller, faults = self.control(rest), FaultCounter(self.robot)
         references, step, sequence = next_reference(self.desired), -1, self._start(controller)

@@ -127,7 +127,7 @@ class FrameValidator:
         return max(0.0, delay_s)
 
     def measured(self, frame: TrackerFrame) -> tuple[str, str]:
-        """Whether the device measured every tool, wherever it is: the status, and its detail. Keeps nothing."""
+        """Whether the device measured every tool, at any place: the status, and its detail. Keeps nothing."""
         count, limit_mm = self.robot.modules + 1, self.robot.limits.largest_rms_mm
         if frame.poses.shape != (count, 4, 4) or len(frame.valid) != count:
             return WRONG_NUMBER, f"{len(frame.poses)}, expected {count}"

@@ -122,7 +122,7 @@ def network_of(checkpoint: dict[str, Any]) -> nn.Module:
     """The network with its weights, in evaluation mode."""
     description, weights = checkpoint["network"], checkpoint["weights"]
     try:
-        with torch.device("meta"):  # needs no memory, whatever sizes the file claims
+        with torch.device("meta"):  # needs no memory for the sizes that the file claims
             networks.build(description).load_state_dict(weights, assign=True)
         network = networks.build(description)
         network.load_state_dict(weights)

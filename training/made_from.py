@@ -62,7 +62,7 @@ def _file(name: str) -> Path | None:
 
 
 def _imports(node: ast.AST) -> Iterator[str]:
-    """Names that may be modules of modsoft, wherever in the file they are imported."""
+    """Names that may be modules of modsoft, at any place in the file."""
     if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
         return
     if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("modsoft"):

@@ -56,11 +56,11 @@ def _check_sensors(hello: Hello, sensors: Sensors, name: str) -> None:
     board = (hello.sensor_zero_mv, hello.sensor_full_mv, hello.sensor_full)
     expected = (round(1000 * sensors.zero_v), round(1000 * sensors.full_v), to_units(sensors.full_scale_bar))
     if hello.sensors and board != expected:
-        found, wanted = (
+        of_board, of_robot = (
             f"{zero / 1000:g} to {full / 1000:g} V for 0 to {to_bar(units):g} bar"
             for zero, full, units in (board, expected)
         )
         raise ProtocolMismatch(
-            f"pressure sensors: the board at {name} has {found}, the robot file {wanted}; correct SENSOR_ZERO_MV, "
+            f"pressure sensors: the board at {name} has {of_board}, the robot file {of_robot}; correct SENSOR_ZERO_MV, "
             "SENSOR_FULL_MV and SENSOR_FULL in firmware/limits.h and flash it, or [sensors] in the robot file"
         )

@@ -19,7 +19,7 @@ AXIS_MM = 25.0  # length of a drawn axis
 
 
 def draw(measured: Measured, calibration: Calibration, path: Path) -> str:
-    """Draws into `path`, whatever the user's settings of matplotlib. Returns why there is no picture, or nothing."""
+    """Draws into `path` with any settings of matplotlib. Returns why there is no picture, or nothing."""
     try:
         matplotlib = importlib.import_module("matplotlib")
         figures = importlib.import_module("matplotlib.figure")

@@ -1,4 +1,4 @@
-"""A tracker's client in a process of its own: whatever becomes of it, the runtime loses frames and nothing else.
+"""A tracker's client in a process of its own: if it crashes or hangs, the runtime loses frames only.
 
 The process reads the client and sends typed messages (`modsoft.runtime.tracking.messages`) through a pipe. It ignores
 Ctrl-C and ends with the runtime. If it dies, is silent or sends anything else, it is started again, and the limits of

@@ -90,7 +90,7 @@ def write(record: Record, assessment: Assessment, about: dict[str, str], folder:
     if len(record.tick):
         try:
             plotting.save(lambda: picture(record), folder / "angles.png", dpi=110)
-        except Exception as error:  # noqa: BLE001 - whatever fails in the plot, the report is kept
+        except Exception as error:  # noqa: BLE001 - an error of the plot must not cost the report
             no_picture = f"angles.png is missing: {' '.join(str(error).split())}"
     with written(folder / "report.md") as temporary:
         temporary.write_text(text(record, assessment, about, values, no_picture), encoding="utf-8")

@@ -149,13 +149,13 @@ def collect(
             return header
         shards.open(generation)
         shards.drop_damaged((steps + 1, robot.modules, 3), (steps, robot.modules, robot.action_size))
-        wanted = set(range(count))
+        episodes = set(range(count))
 
         def report() -> None:
-            progress(len(wanted & shards.finished()) * steps, count * steps)
+            progress(len(episodes & shards.finished()) * steps, count * steps)
 
         report()
-        missing = sorted(wanted - shards.finished())
+        missing = sorted(episodes - shards.finished())
         batches = [missing[i : i + simulator.batch_size] for i in range(0, len(missing), simulator.batch_size)]
         for _ in dispatch(_Task(generation, robot, shards, simulator.simulate), batches):
             report()

@@ -53,9 +53,9 @@ def attributes(in_file: Mapping[str, Any], schema: int, where: Path) -> dict[str
             raise ModelError(
                 f"{where}: not a data set of modsoft-collect: no attribute {name_in_file}, expected {ATTRIBUTES[name]}"
             )
-    found = whole_number("schema", in_file["schema"], where)
-    if not 1 <= found <= schema:
-        raise ModelError(f"{where}: schema {found}, expected 1 to {schema}; collect it again, or update modsoft")
+    version = whole_number("schema", in_file["schema"], where)
+    if not 1 <= version <= schema:
+        raise ModelError(f"{where}: schema {version}, expected 1 to {schema}; collect it again, or update modsoft")
     return {name: in_file[name_in_file] for name, name_in_file in names.items()}
 
 
@@ -93,12 +93,13 @@ def generation(value: Any, steps: int, where: Path) -> dict[str, Any]:
     return {SCHEMA_1_SETTINGS.get(name, name): setting for name, setting in settings.items()}
 
 
-def planar_state(found: Any, schema: int, robot: robot_file.Robot, where: Path) -> None:
+def planar_state(value: Any, schema: int, robot: robot_file.Robot, where: Path) -> None:
     """Refuses planar data of releases 0.1, whose state was (v_x, v_y)."""
-    if robot.motion == "planar" and int(np.asarray(found).item()) < schema:
+    version = int(np.asarray(value).item())
+    if robot.motion == "planar" and version < schema:
         raise ModelError(
-            f"{where}: schema {int(np.asarray(found).item())} of a planar robot, with the state (v_x, v_y) of release "
-            f"0.1; expected schema {schema}, state (v_x, v_z); collect it again"
+            f"{where}: schema {version} of a planar robot, with the state (v_x, v_y) of release 0.1; "
+            f"expected schema {schema}, state (v_x, v_z); collect it again"
         )
 
 
@@ -122,8 +123,8 @@ def shapes(configuration: tuple[int, ...], action: tuple[int, ...], robot: robot
         ("configuration", configuration, (episodes, steps + 1, robot.modules, 3), "(episodes, steps + 1, {1}, 3)"),
     ):
         if shape != expected or 0 in shape:
-            wanted = f"{expected}" if 0 not in expected else in_words.format(0, robot.modules, robot.action_size)
-            raise ModelError(f"{where}: {name} has the shape {shape}, expected {wanted} for robot {robot.name}")
+            full_shape = f"{expected}" if 0 not in expected else in_words.format(0, robot.modules, robot.action_size)
+            raise ModelError(f"{where}: {name} has the shape {shape}, expected {full_shape} for robot {robot.name}")
 
 
 def configuration(values: Array, motion: str, where: Path) -> None:
