@@ -180,7 +180,7 @@ def run_pumps(board, times):
         board._io_thread.pump()
 
 
-def test_silent_port_is_reset_three_times_before_the_error(new_board):
+def test_silent_port_is_reset_three_times_before_error(new_board):
     port = VirtualPort(new_board, firmware=False)
     with pytest.raises(DeviceAbsent, match="no byte received"):
         connect(port)
@@ -203,7 +203,7 @@ def test_lost_first_hello_causes_one_reset(port):
     assert (port.resets, board.hello.boot_id, port.bytes_to_bootloader) == (1, 2, 0)
 
 
-def test_board_that_does_not_reset_on_opening_gets_a_hello_request(new_board):
+def test_board_that_does_not_reset_on_opening_gets_hello_request(new_board):
     port = VirtualPort(new_board, reset_on_open=False)
     port.run(10_000)
     port.pending = b""
@@ -214,7 +214,7 @@ def test_board_that_does_not_reset_on_opening_gets_a_hello_request(new_board):
     board.arm(ROBOT)
 
 
-def test_fault_of_a_killed_host_is_cleared_only_at_arming(new_board):
+def test_fault_of_killed_host_is_cleared_only_at_arming(new_board):
     port = VirtualPort(new_board, reset_on_open=False)
     first = connect(port)
     first.arm(ROBOT)
@@ -276,7 +276,7 @@ def test_noise_is_reported_as_wrong_baud_rate(new_board):
         ("channel = 5", "channel = 11", "channel 11, the board at virtual has channels 0 to 10"),
     ],
 )
-def test_board_that_does_not_fit_the_robot_file_is_never_armed(rig, old, new, complaint):
+def test_board_that_does_not_fit_robot_file_is_never_armed(rig, old, new, complaint):
     board, port = rig
     with pytest.raises(ProtocolMismatch, match=complaint):
         board.arm(changed(old, new))
@@ -284,14 +284,14 @@ def test_board_that_does_not_fit_the_robot_file_is_never_armed(rig, old, new, co
     assert port.board.state == State.IDLE
 
 
-def test_sensors_of_the_robot_file_do_not_matter_to_a_board_without_sensors(rig):
+def test_sensors_of_robot_file_do_not_matter_to_board_without_sensors(rig):
     board, port = rig
     board._connection.hello = board.hello._replace(sensors=0)
     board.arm(changed("zero_v = 0.0", "zero_v = 0.5"))
     assert port.board.state == State.ARMED
 
 
-def test_board_under_pressure_is_armed_when_the_pressure_is_down(rig):
+def test_board_under_pressure_is_armed_when_pressure_is_down(rig):
     board, port = rig
     port.follows = False
     port.board.measured[:3] = [600, 499, 2100]
@@ -337,7 +337,7 @@ def test_run_continues_after_lost_frames(rig):
     assert board.vent()
 
 
-def test_arming_succeeds_after_a_lost_answer(rig):
+def test_arming_succeeds_after_lost_answer(rig):
     board, port = rig
     original = port.step
     dropped = []
@@ -356,7 +356,7 @@ def test_arming_succeeds_after_a_lost_answer(rig):
     assert port.board.state == State.RUNNING
 
 
-def test_board_vents_within_670_ms_of_the_last_byte_of_a_killed_host(rig):
+def test_board_vents_within_670_ms_of_last_byte_of_killed_host(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2, pressures=np.full(6, 0.35))
@@ -367,7 +367,7 @@ def test_board_vents_within_670_ms_of_the_last_byte_of_a_killed_host(rig):
     assert port.board.faults == Fault.LINK_TIMEOUT
 
 
-def test_stopped_host_finds_a_latched_fault_when_it_continues(rig):
+def test_fault_after_stop_of_host_is_latched(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 2)
@@ -379,7 +379,7 @@ def test_stopped_host_finds_a_latched_fault_when_it_continues(rig):
     assert not any(port.board.counts)
 
 
-def test_board_detects_a_stopped_control_loop(rig):
+def test_board_detects_stopped_control_loop(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
@@ -394,7 +394,7 @@ def test_board_detects_a_stopped_control_loop(rig):
     assert board.vent()
 
 
-def test_board_keeps_running_while_the_loop_holds_its_set_points(rig):
+def test_board_keeps_running_while_loop_holds_its_set_points(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 1)
@@ -405,7 +405,7 @@ def test_board_keeps_running_while_the_loop_holds_its_set_points(rig):
     assert port.board.state == State.RUNNING
 
 
-def test_unplugged_cable_is_a_loss_without_a_confirmed_vent(rig):
+def test_unplugged_cable_is_loss_without_confirmed_vent(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 2)
@@ -427,7 +427,7 @@ def test_board_that_receives_no_frames_vents_and_reports_it(rig):
     assert port.board.faults == Fault.LINK_TIMEOUT
 
 
-def test_after_three_lost_set_points_the_host_reports_the_loss_and_stops_sending(rig):
+def test_three_lost_set_points_end_sending_with_error(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 2)
@@ -441,7 +441,7 @@ def test_after_three_lost_set_points_the_host_reports_the_loss_and_stops_sending
     assert len(port.written) == silent_from
 
 
-def test_refused_set_points_are_reported_as_a_loss(rig):
+def test_refused_set_points_are_reported_as_loss(rig):
     board, port = rig
     board.arm(changed("channel = 5", "channel = 6"))
     with pytest.raises(LostInRun, match=r"not acknowledged \(refused: range\)"):
@@ -485,7 +485,7 @@ def test_board_reset_in_mid_run_is_detected_and_no_more_is_sent(rig):
     assert port.board.state == State.IDLE
 
 
-def test_waiting_set_point_is_never_sent_to_a_restarted_board(rig):
+def test_waiting_set_point_is_never_sent_to_restarted_board(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 1)
@@ -500,7 +500,7 @@ def test_waiting_set_point_is_never_sent_to_a_restarted_board(rig):
     assert not any(port.board.counts)
 
 
-def test_vent_is_confirmed_only_by_a_status_after_the_request(rig):
+def test_vent_is_confirmed_only_by_status_after_request(rig):
     """A status that was sent before the request proves nothing: the board may have been armed since."""
     board, port = rig
     port.run(110)
@@ -527,7 +527,7 @@ def test_open_valve_is_reported_as_residual_pressure(rig):
     assert 950 <= port.now_ms - began_ms <= 1100
 
 
-def test_host_waits_for_a_vented_robot_no_longer_than_needed(rig):
+def test_host_waits_for_vented_robot_no_longer_than_needed(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
@@ -538,7 +538,7 @@ def test_host_waits_for_a_vented_robot_no_longer_than_needed(rig):
 
 
 @pytest.mark.parametrize(("p_down", "residual_bar"), [(2000, {0: 0.2}), (2001, {})])
-def test_residual_pressure_is_compared_with_the_limit_that_the_board_reports(rig, p_down, residual_bar):
+def test_residual_pressure_is_compared_with_limit_of_board(rig, p_down, residual_bar):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2)
@@ -549,7 +549,7 @@ def test_residual_pressure_is_compared_with_the_limit_that_the_board_reports(rig
     assert board.residual_pressures_bar() == pytest.approx(residual_bar)
 
 
-def test_boot_id_shows_a_restart_between_two_reads(rig):
+def test_boot_id_shows_restart_between_two_reads(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 1)
@@ -590,7 +590,7 @@ def test_only_newest_set_point_is_sent_and_only_once(rig):
     assert board.status.acked_seq == 2
 
 
-def test_over_pressure_trips_the_host(rig):
+def test_over_pressure_trips_host(rig):
     board, port = rig
     board.arm(ROBOT)
     tick = run(board, port, 1)
@@ -609,7 +609,7 @@ def test_over_pressure_trips_the_host(rig):
 
 
 @pytest.mark.parametrize("mode", list(VentMode))
-def test_vent_succeeds_only_after_the_board_reports_it(rig, mode):
+def test_vent_succeeds_only_after_board_reports_it(rig, mode):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 2, pressures=np.full(6, 0.35))
@@ -620,7 +620,7 @@ def test_vent_succeeds_only_after_the_board_reports_it(rig, mode):
     assert (duration_ms <= 20) if mode is VentMode.DUMP else (175 <= duration_ms <= 300)
 
 
-def test_vent_reports_failure_when_the_valves_stay_open(rig):
+def test_vent_reports_failure_when_valves_stay_open(rig):
     board, port = rig
     board.arm(ROBOT)
     run(board, port, 1)
@@ -628,7 +628,7 @@ def test_vent_reports_failure_when_the_valves_stay_open(rig):
     assert board.vent(timeout_s=0.2) is False
 
 
-def test_context_manager_vents_on_an_exception(port):
+def test_context_manager_vents_on_exception(port):
     def fail():
         with connect(port) as board:
             board.arm(ROBOT)

@@ -13,7 +13,7 @@ FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
 VARIANT = Path("/usr/share/arduino/hardware/arduino/avr/variants/mega/pins_arduino.h")
 
 
-def test_builds_for_the_mega_and_is_small():
+def test_builds_for_mega_and_is_small():
     if shutil.which("avr-gcc") is None or not VARIANT.exists():
         pytest.skip("needs Debian packages gcc-avr avr-libc arduino-core-avr")
     done = subprocess.run(["make", "-C", str(FIRMWARE)], capture_output=True, text=True, check=False)
@@ -27,7 +27,7 @@ def test_builds_for_the_mega_and_is_small():
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None or shutil.which("make") is None, reason="needs gcc and make")
-def test_builds_in_a_folder_of_any_name(tmp_path):
+def test_builds_in_folder_of_any_name(tmp_path):
     root = tmp_path / "My (d)rive's & x : $HOME %"
     for part in ("firmware", "tests/firmware", "tools/fuzz"):
         shutil.copytree(FIRMWARE.parent / part, root / part)
@@ -83,7 +83,7 @@ def test_impossible_limits_do_not_compile(tmp_path, changed, complaint):
     assert complaint in done.stderr
 
 
-def test_channels_have_the_pins_of_the_arduino_core():
+def test_channels_have_pins_of_arduino_core():
     """Port and bit of each pin in pins.h must be those of the Arduino core's table of the MEGA."""
     if not VARIANT.exists():
         pytest.skip("needs Debian package arduino-core-avr")

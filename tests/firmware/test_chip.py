@@ -94,7 +94,7 @@ def test_pins_are_low_before_they_become_outputs_and_no_timer_is_connected(chip,
 
 
 @pytest.mark.parametrize("channel", range(11))
-def test_counts_reach_the_register_of_their_pin_and_no_other(chip, outputs, channel):
+def test_counts_reach_register_of_their_pin_and_no_other(chip, outputs, channel):
     chip.code.pwm_begin()
     timer, unit, _, _ = outputs[channel]
     before = bytes(chip.registers)
@@ -106,7 +106,7 @@ def test_counts_reach_the_register_of_their_pin_and_no_other(chip, outputs, chan
     assert bytes(chip.registers) == before
 
 
-def test_pin_of_the_bootloader_is_not_used(chip):
+def test_pin_of_bootloader_is_not_used(chip):
     chip.code.pwm_begin()
     before = bytes(chip.registers)
     for channel in (11, 12, 255):
@@ -149,7 +149,7 @@ def test_no_channel_is_measured_before_its_first_reading(chip):
 
 
 @pytest.mark.parametrize("control", [0b1_1_000_111, 0b0_0_000_111], ids=["converting", "converter off"])
-def test_poll_without_a_completed_conversion_changes_no_reading(chip, control):
+def test_poll_without_completed_conversion_changes_no_reading(chip, control):
     sensors = begin(chip)
     chip.registers[ADCSRA] = control
     before = bytes(sensors)
@@ -165,7 +165,7 @@ def test_supply_first_then_8_rounds_of_all_sensors(chip):
     assert chip.registers[ADCSRA] & CONVERTING
 
 
-def test_supply_follows_from_the_settled_reference(chip):
+def test_supply_follows_from_settled_reference(chip):
     sensors = begin(chip)
     convert(chip, sensors, 1)
     assert sensors.supply_mv == 0  # the reference has not settled
@@ -196,7 +196,7 @@ def sensor45(native, tmp_path):
 @pytest.mark.parametrize(
     ("millivolt", "units"), [(500, 0), (4500, 20000), (2500, 10000), (250, -1250), (0, -2500), (5000, 22500)]
 )
-def test_pressure_of_a_sensor_with_an_offset(sensor45, millivolt, units):
+def test_pressure_of_sensor_with_offset(sensor45, millivolt, units):
     sensors = begin(sensor45)
     for _ in range(2):
         convert(sensor45, sensors, 225)
@@ -207,7 +207,7 @@ def test_pressure_of_a_sensor_with_an_offset(sensor45, millivolt, units):
     assert abs(sensors.measured[0] - units) <= 25  # half a step of the converter, a whole one at its end
 
 
-def test_pressures_beyond_the_protocol_are_limited(native, tmp_path):
+def test_pressures_beyond_protocol_are_limited(native, tmp_path):
     """Readings of 32768.1 and -32768.1 units; -32768 is NOT_MEASURED."""
     chip = chip_of(native / "libsensor9bar.so", tmp_path)
     sensors = begin(chip)
@@ -220,7 +220,7 @@ def test_pressures_beyond_the_protocol_are_limited(native, tmp_path):
     assert list(sensors.measured)[4:6] == pytest.approx(exact, abs=0.6)
 
 
-def test_inputs_8_to_11_are_selected_by_the_sixth_bit(sensor45):
+def test_inputs_8_to_11_are_selected_by_sixth_bit(sensor45):
     sensors = begin(sensor45)
     assert (sensor45.registers[DIDR0], sensor45.registers[DIDR2]) == (0x81, 0x09)
     for _ in range(2):
@@ -235,7 +235,7 @@ def test_inputs_8_to_11_are_selected_by_the_sixth_bit(sensor45):
     assert [channel for channel in range(12) if sensors.measured[channel] != NOT_MEASURED] == [0, 7, 8, 11]
 
 
-def test_without_sensors_only_the_supply_is_measured(native, tmp_path):
+def test_without_sensors_only_supply_is_measured(native, tmp_path):
     chip = chip_of(native / "libsensorless.so", tmp_path)
     sensors = begin(chip)
     assert {convert(chip, sensors, 225) for _ in range(500)} == {REFERENCE}
@@ -247,7 +247,7 @@ def test_without_sensors_only_the_supply_is_measured(native, tmp_path):
 # ---- reset
 
 
-def test_power_on_gives_a_random_id_and_every_reset_the_next_one(chip):
+def test_boot_id_is_random_at_power_on_and_counts_resets(chip):
     first, cause = chip.boot()
     assert cause == ResetCause.POWER_ON
     assert first == zlib.crc32(bytes(36))  # all memory that a reset keeps
@@ -266,14 +266,14 @@ def test_power_on_gives_a_random_id_and_every_reset_the_next_one(chip):
         (0b0011, ResetCause.POWER_ON),
     ],
 )
-def test_reset_flags_give_the_cause(chip, flags, cause):
+def test_reset_flags_give_cause(chip, flags, cause):
     chip.boot()
     assert chip.boot(flags)[1] == cause
     assert chip.registers[MCUSR] == 0, "the flags would remain after the next reset"
 
 
 @pytest.mark.parametrize(("hung_ms", "cause"), [(99, ResetCause.EXTERNAL), (100, ResetCause.WATCHDOG)])
-def test_clock_shows_a_watchdog_reset_after_the_bootloader(chip, hung_ms, cause):
+def test_clock_shows_watchdog_reset_after_bootloader(chip, hung_ms, cause):
     chip.boot()
     chip.code.boot_feed_watchdog(5000, 5000)
     chip.millis.value = 5000 + hung_ms
@@ -283,7 +283,7 @@ def test_clock_shows_a_watchdog_reset_after_the_bootloader(chip, hung_ms, cause)
 
 
 @pytest.mark.parametrize(("supply_mv", "cause"), [(4499, ResetCause.BROWN_OUT), (4500, ResetCause.EXTERNAL)])
-def test_low_supply_shows_a_brown_out_after_the_bootloader(chip, supply_mv, cause):
+def test_low_supply_shows_brown_out_after_bootloader(chip, supply_mv, cause):
     chip.boot()
     chip.code.boot_feed_watchdog(5000, supply_mv)
     chip.millis.value = 5001

@@ -17,7 +17,7 @@ def replay(program):
     return subprocess.run([program, *CORPUS], capture_output=True, text=True, check=False)
 
 
-def test_no_input_of_the_corpus_violates_a_rule(native):
+def test_no_input_of_corpus_violates_rule(native):
     done = replay(native / "replay")
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"{len(CORPUS)} inputs, no rule violated\n"

@@ -25,7 +25,7 @@ def test_corrupted_and_repeated_frames_are_not_applied(native, kind):
 
 
 @pytest.mark.parametrize(("length", "accepted"), [(protocol.MAX_DECODED, True), (protocol.MAX_DECODED + 1, False)])
-def test_longest_frame_is_accepted_and_a_longer_one_dropped(board, length, accepted):
+def test_longest_frame_is_accepted_and_longer_one_dropped(board, length, accepted):
     """The longest frame is answered (as an unknown type), a longer one is dropped, and the next frame is accepted."""
     body = bytes((0x7F, 5, 0)) + bytes(range(1, length - 6))
     board.messages()
@@ -37,7 +37,7 @@ def test_longest_frame_is_accepted_and_a_longer_one_dropped(board, length, accep
 
 
 @pytest.mark.parametrize("length", [0, 1, 2])
-def test_bytes_shorter_than_a_header_are_no_frame_despite_a_correct_crc(board, length):
+def test_bytes_shorter_than_header_are_no_frame_despite_correct_crc(board, length):
     body = bytes(length)
     board.messages()
     board.feed(b"\0" + cobs.cobs_encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0")
@@ -76,7 +76,7 @@ def test_valid_frame_followed_by_more_bytes_without_delimiter_is_dropped(board):
     assert board.library.board_rx_bad(board.handle) == 1
 
 
-def test_only_the_end_of_a_valid_frame_returns_true(board):
+def test_only_end_of_valid_frame_returns_true(board):
     """The sketch takes one valid frame in a pass."""
     receive = board.library.supervisor_receive
     receive.restype = ctypes.c_bool

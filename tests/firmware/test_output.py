@@ -28,7 +28,7 @@ def test_output_stays_between_0_and_p_max(sanitised, target, reached):
     assert list(stage.applied) == [reached] * 11 + [0]  # channel 11 is the bootloader's LED
 
 
-def test_output_rises_and_falls_at_the_slew_limit(sanitised):
+def test_output_rises_and_falls_at_slew_limit(sanitised):
     stage = OutputStage()
     assert [step(sanitised, stage, 50) for _ in range(4)] == [20, 40, 50, 50]
     assert [step(sanitised, stage, 0) for _ in range(4)] == [30, 10, 0, 0]
@@ -59,7 +59,7 @@ def test_vented_means_every_channel_at_zero(sanitised):
         assert not sanitised.output_is_vented(ctypes.byref(stage))
 
 
-def test_counts_are_proportional_to_the_pressure(sanitised):
+def test_counts_are_proportional_to_pressure(sanitised):
     stage = OutputStage()
     sanitised.output_counts.restype = ctypes.c_uint16
     counts = []
@@ -69,7 +69,7 @@ def test_counts_are_proportional_to_the_pressure(sanitised):
     assert counts == [0, 0, 1, 137, 478, 4096]
 
 
-def test_fractional_step_keeps_the_mean_rate_exact(native):
+def test_fractional_step_keeps_mean_rate_exact(native):
     """The remainder of a step is kept, so that the mean rate is exact."""
     library = ctypes.CDLL(str(native / "libslew.so"))
     stage = OutputStage()

@@ -44,7 +44,7 @@ def compile_sketch(ide):
     return run.returncode, run.stdout + run.stderr
 
 
-def test_sketch_compiles_in_the_arduino_ide(ide):
+def test_sketch_compiles_in_arduino_ide(ide):
     (ide / "hardware/arduino/avr/platform.local.txt").write_text(f"compiler.cpp.extra_flags={DEFINE}\n")
     code, output = compile_sketch(ide)
     assert code == 0, output
@@ -54,7 +54,7 @@ def test_sketch_compiles_in_the_arduino_ide(ide):
     assert "/firmware/" not in output  # no warning about our files
 
 
-def test_readme_names_the_board_and_the_definition():
+def test_readme_names_board_and_definition():
     readme = (FIRMWARE / "README.md").read_text()
     assert BOARD in readme
     assert DEFINE in readme

@@ -51,7 +51,7 @@ def test_hello_is_sent_once_at_boot_before_all_else(board):
     assert len(answers) == 10
 
 
-def test_before_the_first_pass_no_channel_is_measured(board):
+def test_before_first_pass_no_channel_is_measured(board):
     (status,) = board.send(Vent(VentMode.RAMP))
     assert (status.state, status.measured) == (State.BOOT, (protocol.NOT_MEASURED,) * 12)
 
@@ -81,7 +81,7 @@ def test_foreign_hello_request_is_answered_and_refused(board):
         assert [type(answer) for answer in answers] == [Hello]
 
 
-def test_status_reports_the_state_of_the_board(running):
+def test_status_reports_state_of_board(running):
     running.wait(100)
     status = [frame.message for frame in running.messages()][-1]
     assert status.state == State.RUNNING
@@ -126,7 +126,7 @@ def test_every_pass_reports_every_check(running):
 # ---- arming
 
 
-def test_arm_needs_a_second_of_heartbeats(board):
+def test_arm_needs_heartbeats_for_one_second(board):
     board.heartbeats(1000)
     board.now_ms -= 1
     assert reason(board.arm()) == NackReason.STATE
@@ -154,14 +154,14 @@ def test_arm_needs_unbroken_heartbeats(board, gap_ms, state):
 
 
 @pytest.mark.parametrize(("gap_ms", "state"), [(300, State.ARMED), (301, State.IDLE)])
-def test_arm_needs_a_recent_heartbeat(board, gap_ms, state):
+def test_arm_needs_recent_heartbeat(board, gap_ms, state):
     board.heartbeats(1500)
     board.wait(gap_ms - 100)
     board.arm()
     assert board.state == state
 
 
-def test_session_starts_at_the_sequence_number_of_its_arm(board):
+def test_session_starts_at_sequence_number_of_its_arm(board):
     board.seq = 200
     board.heartbeats(1100)
     board.arm()
@@ -169,7 +169,7 @@ def test_session_starts_at_the_sequence_number_of_its_arm(board):
     assert (status.acked_seq, status.state) == (201, State.RUNNING)
 
 
-def test_long_wait_before_the_first_set_point_is_no_control_timeout(board):
+def test_long_wait_before_first_set_point_is_no_control_timeout(board):
     board.heartbeats(1100)
     board.arm()
     board.heartbeats(2000, ticking=False)
@@ -189,13 +189,13 @@ def test_long_wait_before_the_first_set_point_is_no_control_timeout(board):
         ({"p_full": 100000}, NackReason.RANGE),
     ],
 )
-def test_arm_with_a_wrong_field_is_refused(board, changes, expected):
+def test_arm_with_wrong_field_is_refused(board, changes, expected):
     board.heartbeats(1100)
     assert reason(board.arm(**changes)) == expected
     assert board.state == State.IDLE
 
 
-def test_repeated_arm_keeps_the_session(board):
+def test_repeated_arm_keeps_session(board):
     board.heartbeats(1100)
     board.arm()
     (again,) = board.arm(new_session=1)
@@ -240,7 +240,7 @@ def test_session_numbers_wrap_and_skip_zero(board):
 # ---- set-points
 
 
-def test_outputs_reach_the_set_points_at_the_slew_limit(board):
+def test_outputs_reach_set_points_at_slew_limit(board):
     board.heartbeats(1100)
     board.arm()
     board.set(*FULL)
@@ -253,7 +253,7 @@ def test_outputs_reach_the_set_points_at_the_slew_limit(board):
     assert board.applied == [*FULL, 0, 0, 0, 0, 0, 0]
 
 
-def test_counts_are_the_pressure_over_full_scale(running):
+def test_counts_are_pressure_over_full_scale(running):
     assert running.counts == [round(pressure * 4096 / 30000) for pressure in running.applied]
     for pressure in range(0, 3501, 7):
         running.set(pressure)
@@ -265,14 +265,14 @@ def test_counts_are_the_pressure_over_full_scale(running):
 
 
 @pytest.mark.parametrize("pressures", [(-1,), (3501,), (800, 32767), (0, 0, 0, 0, 0, 0, 800), (0,) * 11 + (800,)])
-def test_set_out_of_range_is_refused_as_a_whole(running, pressures):
+def test_set_out_of_range_is_refused_entirely(running, pressures):
     before = [running.library.board_set_point(running.handle, channel) for channel in range(12)]
     assert reason(running.set(*pressures)) == NackReason.RANGE
     assert [running.library.board_set_point(running.handle, channel) for channel in range(12)] == before
     assert running.state == State.RUNNING
 
 
-def test_set_refused_outside_a_session(board):
+def test_set_refused_outside_session(board):
     board.heartbeats(1100)
     assert reason(board.set(800)) == NackReason.STATE
 
@@ -292,7 +292,7 @@ def test_set_is_accepted_up_to_8_sequence_numbers_ahead(running):
         assert status.acked_seq == last
 
 
-def test_first_set_must_follow_the_arm(board):
+def test_first_set_must_follow_arm(board):
     board.heartbeats(1100)
     board.arm()
     assert reason(board.set(800, seq=0)) == NackReason.SEQUENCE
@@ -373,7 +373,7 @@ def test_lost_host_vents_in_time(running):
     assert running.counts == [0] * 12
 
 
-def test_lost_host_while_armed_is_a_fault_too(board):
+def test_lost_host_while_armed_is_fault(board):
     board.heartbeats(1100)
     (status,) = board.arm()
     assert status.state == State.ARMED
@@ -383,7 +383,7 @@ def test_lost_host_while_armed_is_a_fault_too(board):
     assert (board.state, board.faults) == (State.FAULT, Fault.LINK_TIMEOUT)
 
 
-def test_garbage_and_corrupted_frames_do_not_feed_the_link_timer(running):
+def test_garbage_and_corrupted_frames_do_not_feed_link_timer(running):
     good = codec.encode(protocol.Heartbeat(1000), 0, running.session)
     for _ in range(310):
         running.feed(good[:5] + b"\x55" + good[6:] + b"\xaa\x00")
@@ -394,7 +394,7 @@ def test_garbage_and_corrupted_frames_do_not_feed_the_link_timer(running):
     assert isinstance(running.send(HelloReq(protocol.PROTOCOL_HASH))[0], Hello)
 
 
-def test_heartbeats_of_an_old_session_do_not_feed_the_link_timer(running):
+def test_heartbeats_of_old_session_do_not_feed_link_timer(running):
     for _ in range(31):
         running.tick += 1
         running.send(protocol.Heartbeat(running.tick), session=0)
@@ -422,7 +422,7 @@ def test_control_loop_may_stop_for_one_second(running, waited_ms, state):
     assert running.state == state
 
 
-def test_latched_fault_needs_the_exact_mask_and_the_pressures_down(running):
+def test_latched_fault_needs_exact_mask_and_pressures_down(running):
     running.wait(301)
     assert running.faults == Fault.LINK_TIMEOUT
     assert reason(running.set(800)) == NackReason.STATE
@@ -479,7 +479,7 @@ def test_short_over_pressure_is_no_fault(running):
     assert running.faults == Fault(0)
 
 
-def test_over_pressure_during_a_stall_of_any_length_dumps(board):
+def test_over_pressure_during_stall_of_any_length_dumps(board):
     """The next pass comes after 65.6 s, which 16 bits of milliseconds would count as 50 ms."""
     board.wait(1)
     board.measured[0] = 9000
@@ -496,7 +496,7 @@ def test_over_pressure_is_detected_while_idle_and_stays_latched(board):
 
 
 @pytest.mark.parametrize(("reading", "fault"), [(1499, Fault.LEAK), (2501, Fault.SENSOR)])
-def test_sensor_that_does_not_follow_the_output_is_a_fault(running, reading, fault):
+def test_sensor_that_does_not_follow_output_is_fault(running, reading, fault):
     running.measured[3] = reading
     running.heartbeats(1900)
     running.send(protocol.Heartbeat(running.tick + 1))
@@ -513,13 +513,13 @@ def test_small_sensor_difference_is_no_fault(running, reading):
     assert (running.state, running.faults) == (State.RUNNING, Fault(0))
 
 
-def test_pressure_at_the_limit_is_no_over_pressure(board):
+def test_pressure_at_limit_is_no_over_pressure(board):
     board.measured[0] = 4500
     board.wait(500)
     assert board.faults == Fault(0)
 
 
-def test_over_pressure_counts_from_the_first_pass(new_board):
+def test_over_pressure_counts_from_first_pass(new_board):
     """The time before the first reading does not count as over-pressure."""
     board = new_board(start_ms=50_000)
     board.measured[0] = 9000
@@ -529,7 +529,7 @@ def test_over_pressure_counts_from_the_first_pass(new_board):
     assert board.faults == Fault.OVER_PRESSURE
 
 
-def test_channels_without_a_sensor_cause_no_fault(board):
+def test_channels_without_sensor_cause_no_fault(board):
     board.heartbeats(1100)
     board.arm(channels=0x7FF)
     board.set(*(800,) * 11)
@@ -539,7 +539,7 @@ def test_channels_without_a_sensor_cause_no_fault(board):
     assert board.state == State.RUNNING
 
 
-def test_channels_outside_the_session_cause_no_leak(board):
+def test_channels_outside_session_cause_no_leak(board):
     board.heartbeats(1100)
     board.arm(channels=0x03)
     board.set(800, 800)
@@ -572,7 +572,7 @@ def test_vent_in_fault_stays_in_fault(running):
     assert status.applied == (0,) * 12
 
 
-def test_no_set_point_opens_a_valve_while_idle(board):
+def test_no_set_point_opens_valve_while_idle(board):
     board.heartbeats(1100)
     for seq in range(256):
         board.set(*FULL, seq=seq, session=seq)
@@ -581,7 +581,7 @@ def test_no_set_point_opens_a_valve_while_idle(board):
 
 
 @pytest.mark.parametrize(("taken", "refusals"), [(11, 4), (10, 3)])
-def test_queue_to_the_host_accepts_255_bytes(board, taken, refusals):
+def test_queue_to_host_accepts_255_bytes(board, taken, refusals):
     """A full ring buffer would look like an empty one: 256 bytes must not be queued."""
     first = b"".join(bytes([board.library.supervisor_next_byte(board.handle)]) for _ in range(taken))
     board.feed(codec.encode(Vent(VentMode.RAMP)) * 2)
@@ -593,7 +593,7 @@ def test_queue_to_the_host_accepts_255_bytes(board, taken, refusals):
     assert len(raw) - taken + (4 - refusals) * nack_size == 266 - taken  # with the last refusal
 
 
-def test_board_never_waits_for_a_host_that_does_not_read(board):
+def test_board_never_waits_for_host_that_does_not_read(board):
     board.start(800)
     for _ in range(100):
         board.feed(codec.encode(HelloReq(protocol.PROTOCOL_HASH), 0, board.session))
@@ -617,7 +617,7 @@ def test_clear_fault_is_answered_immediately(running):
     assert (answer.state, answer.faults) == (State.IDLE, 0)
 
 
-def test_every_frame_of_the_board_carries_the_session(board):
+def test_every_frame_of_board_carries_session(board):
     sessions = []
     for _ in range(3):
         board.heartbeats(1100)
@@ -630,7 +630,7 @@ def test_every_frame_of_the_board_carries_the_session(board):
 
 
 @pytest.mark.parametrize(("channel", "fault"), [(3, Fault.SENSOR), (2, Fault(0)), (4, Fault(0))])
-def test_only_a_channel_of_this_robot_can_disagree(board, channel, fault):
+def test_only_channels_of_robot_can_disagree(board, channel, fault):
     """Armed for channel 3 only: the sensors of its neighbours belong to no chamber of the robot."""
     board.heartbeats(1100)
     board.arm(channels=1 << 3)
@@ -644,7 +644,7 @@ def test_only_a_channel_of_this_robot_can_disagree(board, channel, fault):
 
 @pytest.mark.parametrize(("units", "expected"), [(499, State.ARMED), (500, State.IDLE)])
 @pytest.mark.parametrize("channel", [0, 5])
-def test_arm_refused_while_a_sensor_measures_pressure(board, channel, units, expected):
+def test_arm_refused_while_sensor_measures_pressure(board, channel, units, expected):
     board.heartbeats(1100)
     board.measured[channel] = units
     board.update()
@@ -655,7 +655,7 @@ def test_arm_refused_while_a_sensor_measures_pressure(board, channel, units, exp
 
 
 @pytest.mark.parametrize(("units", "faulty"), [(-1, True), (0, False), (-2500, True)])
-def test_sensor_below_its_range_is_a_fault_in_any_state(board, units, faulty):
+def test_sensor_below_its_range_is_fault_in_any_state(board, units, faulty):
     """With 0 to 5 V sensors a negative pressure cannot be read; with 0.5 to 4.5 V it is a broken wire."""
     board.heartbeats(1100)
     board.measured[4] = units
@@ -665,7 +665,7 @@ def test_sensor_below_its_range_is_a_fault_in_any_state(board, units, faulty):
     assert board.faults == (Fault.SENSOR if faulty else Fault(0))
 
 
-def test_sensor_above_its_range_is_a_sensor_fault_as_well(board):
+def test_sensor_above_its_range_is_fault(board):
     board.measured[4] = 10000
     board.wait(101)
     assert board.faults == Fault.OVER_PRESSURE
@@ -674,7 +674,7 @@ def test_sensor_above_its_range_is_a_sensor_fault_as_well(board):
     assert board.faults == Fault.OVER_PRESSURE | Fault.SENSOR
 
 
-def test_broken_wire_ramps_the_pressures_down(running):
+def test_broken_wire_ramps_pressures_down(running):
     running.measured[0] = -1
     running.wait(100)
     assert running.faults == Fault.SENSOR
@@ -693,7 +693,7 @@ def test_brief_sensor_glitches_are_no_fault(running):
 
 
 @pytest.mark.parametrize("supply_mv", [4499, 0])
-def test_low_supply_ramps_the_pressures_down(running, supply_mv):
+def test_low_supply_ramps_pressures_down(running, supply_mv):
     running.supply_mv = supply_mv
     running.wait(99)
     assert running.state == State.RUNNING
@@ -716,7 +716,7 @@ def test_lowest_allowed_supply_is_no_fault(running):
 
 
 @pytest.mark.parametrize(("units", "faulty"), [(-1251, True), (-1250, False), (21250, False), (21251, True)])
-def test_sensor_with_an_offset_outside_its_range_is_a_fault(board45, units, faulty):
+def test_sensor_with_offset_outside_its_range_is_fault(board45, units, faulty):
     """Below 0.25 V and above 4.75 V the wire is broken."""
     (hello,) = [frame.message for frame in board45.messages()]
     assert (hello.sensor_zero_mv, hello.sensor_full_mv, hello.sensor_full) == (500, 4500, 20000)

@@ -48,7 +48,7 @@ def tools(tmp_path):
     return found
 
 
-def test_help_has_what_a_newcomer_needs():
+def test_help_names_first_steps_and_exit_codes():
     done = run("--help")
     assert done.returncode == 0
     for word in ("First steps", "--print-robot", "--port", "--dry-run", "Exit codes", "robot.toml", "model.onnx"):
@@ -56,7 +56,7 @@ def test_help_has_what_a_newcomer_needs():
     assert run("-h").stdout == done.stdout
 
 
-def test_nothing_heavy_is_imported():
+def test_import_loads_no_heavy_package():
     code = (
         "import sys\n"
         "import modsoft.runtime.cli\n"
@@ -69,7 +69,7 @@ def test_nothing_heavy_is_imported():
     assert done.stdout.split("\n")[:2] == ["[]", "[]"]
 
 
-def test_print_robot_is_a_robot_file(tmp_path):
+def test_print_robot_is_robot_file(tmp_path):
     done = run("--print-robot", "pneumatic-3")
     (tmp_path / "robot.toml").write_text(done.stdout)
     assert robot_file.load(tmp_path / "robot.toml") == robot_file.load("pneumatic-3")
@@ -85,7 +85,7 @@ def test_check_robot(tmp_path):
     assert "chambers" in refused(64, "--check", tmp_path / "robot.toml")
 
 
-def test_check_tells_what_is_still_to_fill_in(tmp_path):
+def test_check_names_missing_settings(tmp_path):
     line = run("--check", "pneumatic-3").stdout.splitlines()[-2]
     assert line == (
         "still to fill in before a run: port under [tracker], or --tracker-port; tools under [tracker], or --tool; "
@@ -104,7 +104,7 @@ def test_check_tells_what_is_still_to_fill_in(tmp_path):
 
 
 @pytest.mark.parametrize(("task", "expected"), [("up", "edge, down"), ("none.npy", "no task file")])
-def test_check_proves_the_task(tmp_path, task, expected):
+def test_check_reads_task(tmp_path, task, expected):
     path = tmp_path / "robot.toml"
     path.write_text(robot_file.text_of("pneumatic-3").replace('task = "down"', f'task = "{task}"'))
     line = refused(64, "--check", path, cwd=tmp_path)
@@ -113,7 +113,7 @@ def test_check_proves_the_task(tmp_path, task, expected):
 
 
 @pytest.mark.parametrize("folder", ["lab", "."])
-def test_the_task_of_a_robot_file_is_beside_it(tmp_path, model_file, folder):
+def test_task_path_starts_at_robot_file(tmp_path, model_file, folder):
     """A file of the same name in the current folder is another task."""
     lab = tmp_path / "lab"
     lab.mkdir()
@@ -132,7 +132,7 @@ def test_the_task_of_a_robot_file_is_beside_it(tmp_path, model_file, folder):
         assert "no task file 'lab/t.npy'" in refused(2, *order, cwd=tmp_path)
 
 
-def test_a_recorded_run_in_a_robot_file_is_beside_it(tmp_path):
+def test_recorded_run_path_starts_at_robot_file(tmp_path):
     lab = tmp_path / "lab"
     (lab / "run").mkdir(parents=True)
     text = robot_file.text_of("pneumatic-3").replace('source = "ndi"', 'source = "replay"')
@@ -148,7 +148,7 @@ def test_list_ports():
     assert run("--list-ports").returncode == 0
 
 
-def test_one_thing_at_a_time():
+def test_options_without_run_exclude_each_other():
     assert "give one of them" in refused(2, "--list-ports", "--check", "pneumatic-3")
     assert "give one of them" in refused(2, "--print-robot", "pneumatic-3", "--check", "pneumatic-3")
 
@@ -172,13 +172,13 @@ def test_no_robot_file_here(tmp_path):
     assert "--robot" in line
 
 
-def test_a_wrong_robot_file(tmp_path, port):
+def test_invalid_robot_file_is_refused(tmp_path, port):
     path = tmp_path / "robot.toml"
     path.write_text(robot_file.text_of("pneumatic-3").replace("full_scale_bar = 3.0", "full_scale = 3.0"))
     assert "full_scale" in refused(64, "--port", port, cwd=tmp_path)
 
 
-def test_a_simulated_robot_is_refused(port):
+def test_simulated_robot_is_refused(port):
     assert "only simulated" in refused(64, "--port", port, "--robot", "cable-4")
 
 
@@ -198,7 +198,7 @@ def test_missing_model_is_refused(tmp_path, port):
     assert "--model" in line
 
 
-def test_a_damaged_model(tmp_path, port, model_file):
+def test_damaged_model_is_refused(tmp_path, port, model_file):
     data = bytearray(model_file.read_bytes())
     data[len(data) // 2] ^= 1
     (tmp_path / "bad.onnx").write_bytes(data)
@@ -240,12 +240,12 @@ def test_missing_tools_are_refused(port, model_file):
     assert ": 1 tool definition file, " in refused(2, *options, "--tool", "base.rom")
 
 
-def test_a_folder_for_a_tool(tmp_path, port, model_file, tools):
+def test_folder_as_tool_file_is_refused(tmp_path, port, model_file, tools):
     options = ["--robot", "pneumatic-3", "--port", port, "--model", model_file, "--tracker-port", "/dev/null"]
     assert "is a folder" in refused(2, *options, *tools[:-1], tmp_path)
 
 
-def test_tools_are_relative_to_the_robot_file(tmp_path, port, model_file):
+def test_tools_are_relative_to_robot_file(tmp_path, port, model_file):
     (tmp_path / "arm").mkdir()
     names = '["base.rom", "1.rom", "2.rom", "3.rom"]'
     text = robot_file.text_of("pneumatic-3").replace("tools = []", f"tools = {names}")
@@ -263,7 +263,7 @@ def test_usage(wrong):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
-def test_the_exit_code_survives_a_standard_error_that_cannot_be_written():
+def test_closed_standard_error_keeps_exit_code():
     with open("/dev/full", "w") as full:
         options = ["--yes", "--robot", "cable-4"]
         done = subprocess.run([SCRIPT, *options], stderr=full, stdin=subprocess.DEVNULL, timeout=60)

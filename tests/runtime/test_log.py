@@ -55,13 +55,13 @@ def test_two_runs_in_one_second(tmp_path):
     second.close(0, "done", {})
 
 
-def test_a_folder_that_cannot_be_made_is_a_usage_error(tmp_path):
+def test_uncreatable_folder_is_usage_error(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="--runs-dir"):
         a_log(tmp_path / "file")
 
 
-def test_a_line_is_in_the_file_before_the_log_is_closed(tmp_path):
+def test_line_is_written_before_close(tmp_path):
     log = a_log(tmp_path)
     path = log.folder / "run.jsonl"
     for tick in range(3):
@@ -96,7 +96,7 @@ def test_arrays_and_nan_become_lists_and_null():
     }
 
 
-def test_a_file_name_that_is_not_utf_8_can_be_logged(tmp_path):
+def test_file_name_that_is_not_utf_8_is_logged(tmp_path):
     name = os.fsdecode(b"model-\xff.onnx")
     assert json.loads(encode({name: [name, np.nan]})) == {"model-\\udcff.onnx": ["model-\\udcff.onnx", None]}
     log = logs.RunLog(tmp_path, "arm", "", {"command": [name]})
@@ -133,7 +133,7 @@ def test_full_disk_loses_lines_but_raises_nothing_and_recovers(tmp_path):
     assert (tmp_path / "run.jsonl").read_bytes() == b'{"tick":0}\n{"tick":1}\n{"t\n{"tick":4}\n'
 
 
-def test_a_disk_that_hangs_does_not_stop_the_loop(tmp_path):
+def test_hanging_disk_does_not_block_loop(tmp_path):
     freed = threading.Event()
 
     def hang(file: int, data: bytes) -> int:
@@ -149,7 +149,7 @@ def test_a_disk_that_hangs_does_not_stop_the_loop(tmp_path):
 
 
 @pytest.mark.parametrize("lines", [3, logs.QUEUE_LINES + 1])
-def test_records_that_a_hanging_disk_did_not_write_are_counted(tmp_path, monkeypatch, lines):
+def test_records_lost_to_hanging_disk_are_counted(tmp_path, monkeypatch, lines):
     freed, begun = threading.Event(), threading.Event()
 
     def hang(file: int, data: bytes) -> int:
@@ -170,7 +170,7 @@ def test_records_that_a_hanging_disk_did_not_write_are_counted(tmp_path, monkeyp
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_records_lost_to_a_bug_in_the_writer_are_counted(tmp_path):
+def test_records_lost_to_bug_in_writer_are_counted(tmp_path):
     writer = logs.Writer(tmp_path / "run.jsonl")
     writer.put({"tick": 0})
     writer.put({"tick": 1, "not JSON": object()})
@@ -180,7 +180,7 @@ def test_records_lost_to_a_bug_in_the_writer_are_counted(tmp_path):
     assert (tmp_path / "run.jsonl").read_text() == '{"tick":0}\n'
 
 
-def test_a_full_disk_leaves_no_half_meta_file(tmp_path, monkeypatch):
+def test_full_disk_leaves_no_partial_meta_file(tmp_path, monkeypatch):
     log = a_log(tmp_path)
     write = Path.write_text
 
@@ -196,7 +196,7 @@ def test_a_full_disk_leaves_no_half_meta_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
-def test_a_real_full_device(tmp_path):
+def test_full_device_loses_lines_only(tmp_path):
     (tmp_path / "run.jsonl").symlink_to("/dev/full")
     writer = logs.Writer(tmp_path / "run.jsonl")
     writer.put({"tick": 0})
@@ -216,7 +216,7 @@ sys.stdin.read()
 """
 
 
-def test_a_killed_process_has_lost_nothing(tmp_path):
+def test_killed_process_loses_no_line(tmp_path):
     with subprocess.Popen(
         [sys.executable, "-c", WRITES_UNTIL_KILLED, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
@@ -228,7 +228,7 @@ def test_a_killed_process_has_lost_nothing(tmp_path):
     assert json.loads((path.parent / "meta.json").read_text())["exit_code"] is None
 
 
-def test_the_folder_of_runs_may_be_a_link_to_a_missing_folder(tmp_path):
+def test_folder_of_runs_may_be_dangling_link(tmp_path):
     (tmp_path / "runs").symlink_to(tmp_path / "disk" / "runs")
     log = a_log(tmp_path / "runs")
     log.close(0, "done", {})

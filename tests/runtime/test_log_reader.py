@@ -83,7 +83,7 @@ def written(folder, *lines, tail=b""):
     return path
 
 
-def test_a_log_is_read_as_it_was_written(tmp_path):
+def test_log_is_read_as_it_was_written(tmp_path):
     records = [
         StartRecord(5, BAR),
         tick_record(0, frame=FRAME, board=BOARD, raw=np.ones((3, 1)), commanded_bar=BAR, sent=True),
@@ -110,7 +110,7 @@ def test_a_log_is_read_as_it_was_written(tmp_path):
     assert np.isnan(run.ticks[0].board.measured_bar[6:]).all()
 
 
-def test_acknowledgements_are_given_by_the_step_that_they_belong_to(tmp_path):
+def test_acknowledgements_are_read_by_their_step(tmp_path):
     later = tick_record(2, acknowledged=Acknowledgement(1, None))
     written(
         tmp_path, tick_record(1, acknowledged=Acknowledgement(0, 7.0)), later, DoneRecord(9, Acknowledgement(2, 5.0))
@@ -118,14 +118,14 @@ def test_acknowledgements_are_given_by_the_step_that_they_belong_to(tmp_path):
     assert read(tmp_path).acknowledged_ms == {0: 7.0, 1: None, 2: 5.0}
 
 
-def test_a_run_that_was_killed_has_no_end(tmp_path):
+def test_killed_run_has_no_end_record(tmp_path):
     written(tmp_path, HeaderRecord(SCHEMA), tick_record(0), tail=b'{"event":"tick","tick":1,"mo')
     run = read(tmp_path)
     assert [record.tick for record in run.ticks] == [0]
     assert run.start is run.end is None
 
 
-def test_a_log_of_release_0_1_0_becomes_the_same_records(tmp_path):
+def test_log_of_release_0_1_0_becomes_same_records(tmp_path):
     written(tmp_path, *OLD_RUN)
     run = read(tmp_path)
     good, held = run.ticks
@@ -140,7 +140,7 @@ def test_a_log_of_release_0_1_0_becomes_the_same_records(tmp_path):
 
 
 @pytest.mark.parametrize("schema", [SCHEMA + 1, 99, 0, -1])
-def test_a_log_of_an_unknown_schema_is_refused_in_one_line(tmp_path, schema):
+def test_log_of_unknown_schema_is_refused_in_one_line(tmp_path, schema):
     path = written(tmp_path, {"event": "header", "schema": schema}, {"event": "step", "k": 0})
     message = (
         rf"^{re.escape(str(path))}: found a run log of schema {schema}, expected 1 to {SCHEMA}; [^\n]*modsoft[^\n]*$"
@@ -167,7 +167,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
-def test_a_line_that_is_no_record_is_named(tmp_path, wrong):
+def test_invalid_line_is_refused_with_its_number(tmp_path, wrong):
     path = written(tmp_path, HeaderRecord(SCHEMA), tick_record(), tail=wrong + b"\n" + encode(tick_record(1)) + b"\n")
     for use in (lambda: read(tmp_path), Follower(path).new):
         with pytest.raises(
@@ -178,14 +178,14 @@ def test_a_line_that_is_no_record_is_named(tmp_path, wrong):
 
 
 @pytest.mark.parametrize("acknowledged", [{"ms": 1}, [1], 1, "x"])
-def test_an_edited_log_of_release_0_1_0_is_refused(tmp_path, acknowledged):
+def test_edited_log_of_release_0_1_0_is_refused(tmp_path, acknowledged):
     written(tmp_path, {**OLD_TICK, "acknowledged": acknowledged})
     with pytest.raises(ModelError, match=r"line 1: not a line of a run's log"):
         read(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["meta.json", "run.jsonl"])
-def test_a_folder_without_one_of_the_files_is_no_run(tmp_path, name):
+def test_folder_without_required_file_is_refused(tmp_path, name):
     written(tmp_path, tick_record())
     (tmp_path / name).unlink()
     with pytest.raises(ModelError, match=re.escape(name)):
@@ -193,14 +193,14 @@ def test_a_folder_without_one_of_the_files_is_no_run(tmp_path, name):
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_a_run_that_an_editor_of_windows_saved_is_read(tmp_path, encoding):
+def test_run_saved_by_windows_editor_is_read(tmp_path, encoding):
     path = written(tmp_path, HeaderRecord(SCHEMA), tick_record(0))
     for each in (path, tmp_path / "meta.json"):
         each.write_bytes(each.read_text().replace("\n", "\r\n").encode(encoding))
     assert [record.tick for record in read(tmp_path).ticks] == [0]
 
 
-def test_a_log_is_followed_while_it_is_written(tmp_path):
+def test_growing_log_is_followed(tmp_path):
     path = written(tmp_path)
     follower = Follower(path)
     data = b"".join(encode(record) + b"\n" for record in (HeaderRecord(SCHEMA), tick_record(0), tick_record(11)))
@@ -214,7 +214,7 @@ def test_a_log_is_followed_while_it_is_written(tmp_path):
     assert (follower.count, follower.last.tick) == (2, 11)
 
 
-def test_a_line_that_a_full_disk_cut_is_skipped(tmp_path):
+def test_truncated_line_is_skipped(tmp_path):
     whole = encode(tick_record(1))
     path = written(tmp_path, tick_record(0), tail=whole[:40] + b"\n" + whole + b"\n")
     assert (
@@ -232,7 +232,7 @@ def test_every_field_is_documented():
     assert [line for line in fields if "  # " not in line] == []
 
 
-def test_keys_of_a_tick(tmp_path):
+def test_keys_of_tick_record(tmp_path):
     """Programs outside this project read these."""
     keys = set(json.loads(encode(tick_record(0))))
     assert keys == {"event", *TickRecord.__struct_fields__}

@@ -29,7 +29,7 @@ from modsoft.runtime.stop import Interrupted, StopKey
 REST = np.array([[0.0, 0.0, 1.0]] * 3)
 
 
-def test_a_whole_task():
+def test_task_runs_to_its_end_at_period():
     world = World(steps=10).run()
     assert [record.tick for record in world.ticks] == list(range(10))
     assert [tick for _, tick, _ in world.sent] == list(range(11))  # actuation 0 first, then every step
@@ -45,7 +45,7 @@ def test_a_whole_task():
     assert [type(record) for record in world.records if not isinstance(record, TickRecord)] == [StartRecord, DoneRecord]
 
 
-def test_pressures_of_a_calibration_replace_those_of_the_actuation():
+def test_calibration_sets_pressures():
     world = World(steps=3)
     rows = np.eye(CHANNELS)[:4] * 0.1
     world.loop = dataclasses.replace(world.loop, set_points_bar=lambda actuation: rows[len(world.sent)])
@@ -54,7 +54,7 @@ def test_pressures_of_a_calibration_replace_those_of_the_actuation():
     assert np.array_equal([record.commanded_bar for record in world.ticks], rows[1:])
 
 
-def test_every_line_can_be_written_and_says_what_the_task_wanted():
+def test_records_are_written_with_desired_angles():
     world = World(steps=5).run()
     for step, record in enumerate(world.ticks):
         written = msgspec.json.decode(encode(record))
@@ -66,7 +66,7 @@ def test_every_line_can_be_written_and_says_what_the_task_wanted():
         assert written["late_ms"] < 1e-3
 
 
-def test_the_model_gets_the_window_that_training_makes():
+def test_model_input_equals_window_of_training():
     world = World(steps=6)
     answers = iter(np.linspace(0.05, 0.3, 6))
     world.answer = lambda features: np.full((3, 1), next(answers))
@@ -80,7 +80,7 @@ def test_the_model_gets_the_window_that_training_makes():
         window.applied(world.ticks[k].actuation)
 
 
-def test_the_actuation_is_held_to_the_robot_files_step():
+def test_actuation_step_is_limited():
     world = World(steps=6)
     world.answer = lambda features: np.array([[2.0], [-2.0], [0.2]])
     world.run()
@@ -90,7 +90,7 @@ def test_the_actuation_is_held_to_the_robot_files_step():
     assert np.array_equal(world.ticks[0].raw, [[2.0], [-2.0], [0.2]])
 
 
-def test_a_bad_frame_holds_the_command_and_the_state():
+def test_bad_frame_holds_command_and_state():
     world = World(steps=8)
     world.tracked = False
 
@@ -119,7 +119,7 @@ def test_a_bad_frame_holds_the_command_and_the_state():
 
 
 @pytest.mark.parametrize("phase_s", np.arange(0.0, PERIOD_S, 0.05))
-def test_silent_tracker_ends_the_run_in_time_at_any_phase(phase_s):
+def test_silent_tracker_ends_run_in_time_at_any_phase(phase_s):
     world = World(steps=20)
 
     def fall_silent():
@@ -134,7 +134,7 @@ def test_silent_tracker_ends_the_run_in_time_at_any_phase(phase_s):
 
 
 @pytest.mark.parametrize("phase_s", np.arange(0.0, PERIOD_S, 0.05))
-def test_a_hidden_tool_ends_the_run_at_the_third_tick(phase_s):
+def test_hidden_tool_ends_run_at_third_tick(phase_s):
     world = World(steps=20)
 
     def hide():
@@ -149,7 +149,7 @@ def test_a_hidden_tool_ends_the_run_at_the_third_tick(phase_s):
     assert world.time_s == pytest.approx(world.due_s(first_bad + 2))
 
 
-def test_nothing_older_than_a_period_is_ever_used():
+def test_frame_older_than_period_is_not_used():
     world = World(steps=30)
 
     def late(age_s):
@@ -165,7 +165,7 @@ def test_nothing_older_than_a_period_is_ever_used():
     assert len(used) < 30
 
 
-def test_a_lost_tracker_ends_the_run_at_once():
+def test_lost_tracker_ends_run_at_once():
     world = World(steps=20)
     world.at[5] = lambda: setattr(world.frames, "error", OSError("read error"))
     with pytest.raises(LostInRun, match="read error"):
@@ -174,7 +174,7 @@ def test_a_lost_tracker_ends_the_run_at_once():
 
 
 @pytest.mark.parametrize("error", [LostInRun("the board is gone"), Tripped("OVER_PRESSURE")])
-def test_a_board_in_trouble_ends_the_run_between_two_ticks(error):
+def test_lost_or_faulty_board_ends_run_between_two_ticks(error):
     world = World(steps=20)
     world.at[5] = lambda: setattr(world, "lost", error)
     with pytest.raises(type(error), match=str(error)):
@@ -206,7 +206,7 @@ def test_stop_request_during_arming_keeps_every_valve_closed():
         (lambda world: setattr(world, "answer", lambda features: np.full((3, 1), 50.0)), ModelError, "good", 50.0),
     ],
 )
-def test_the_step_that_ends_a_run_is_in_its_log(fault, error, status, raw):
+def test_last_step_is_logged(fault, error, status, raw):
     world = World(steps=20)
     world.at[5] = lambda: fault(world)
     with pytest.raises(error):
@@ -220,7 +220,7 @@ def test_the_step_that_ends_a_run_is_in_its_log(fault, error, status, raw):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -50.0])
-def test_what_the_model_must_not_answer_is_not_sent(value):
+def test_invalid_actuation_is_not_sent(value):
     world = World(steps=20)
     world.answer = lambda features: np.full((3, 1), value if len(world.features) == 7 else 0.1)
     with pytest.raises(ModelError):
@@ -229,7 +229,7 @@ def test_what_the_model_must_not_answer_is_not_sent(value):
     assert all(np.isfinite(pressures).all() for *_, pressures in world.sent)
 
 
-def test_a_step_that_takes_too_long_is_not_sent_and_the_next_is_in_time():
+def test_late_step_is_not_sent_and_next_is_in_time():
     world = World(steps=10)
 
     def slow(features):
@@ -249,7 +249,7 @@ def test_a_step_that_takes_too_long_is_not_sent_and_the_next_is_in_time():
     assert world.features[4].reshape(3, -1)[0, 8] == world.ticks[2].actuation[0, 0]
 
 
-def test_missed_ticks_that_are_apart_do_not_add_up():
+def test_separate_missed_ticks_do_not_add_up():
     world = World(steps=30)
     for step in (3, 8, 13, 18, 23):
         world.at[step] = lambda: setattr(world, "time_s", world.time_s + 1.3 * PERIOD_S)
@@ -257,7 +257,7 @@ def test_missed_ticks_that_are_apart_do_not_add_up():
     assert world.tick_statistics.missed == 5
 
 
-def test_skipped_ticks_go_into_the_history_as_held():
+def test_skipped_ticks_go_into_history_as_held():
     world = World(steps=12)
     world.answer = lambda features: np.full((3, 1), 0.05 * len(world.features))
     world.at[4] = lambda: setattr(world, "time_s", world.time_s + 2.3 * PERIOD_S)
@@ -271,14 +271,14 @@ def test_skipped_ticks_go_into_the_history_as_held():
 
 
 @pytest.mark.parametrize("missed", [3, 5])
-def test_a_long_stall_ends_the_run(missed):
+def test_long_stall_ends_run(missed):
     world = World(steps=20)
     world.at[4] = lambda: setattr(world, "time_s", world.time_s + (missed + 0.3) * PERIOD_S)
     with pytest.raises(Tripped, match=f"{missed} control ticks in a row were missed"):
         world.run()
 
 
-def test_a_step_that_sent_nothing_has_no_acknowledgement():
+def test_unsent_step_has_no_acknowledgement():
     """The board still tells that of the set-point before, which must not be taken for this step's."""
     world = World(steps=6)
 
@@ -295,7 +295,7 @@ def test_a_step_that_sent_nothing_has_no_acknowledgement():
     assert world.tick_statistics.acknowledged_ms == pytest.approx([7.0] * 5)
 
 
-def test_the_first_set_point_is_not_older_than_the_start():
+def test_start_is_recorded_before_first_set_point():
     world = World(steps=2)
     give = world.set_pressures
 
@@ -309,7 +309,7 @@ def test_the_first_set_point_is_not_older_than_the_start():
     assert start.mono_ns * 1e-9 == pytest.approx(world.sent[0][0] - 0.004)
 
 
-def test_acknowledgements_belong_to_the_step_before():
+def test_acknowledgement_names_its_step():
     world = World(steps=6)
     world.at[2] = lambda: setattr(world, "acknowledging", False)
     world.at[4] = lambda: setattr(world, "acknowledging", True)
@@ -322,7 +322,7 @@ def test_acknowledgements_belong_to_the_step_before():
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(0, 1.2), min_size=1, max_size=12), st.lists(st.floats(0, 0.9), min_size=1, max_size=12))
-def test_set_points_are_never_less_than_half_a_period_apart(stalls, works):
+def test_set_points_are_at_least_half_period_apart(stalls, works):
     world = World(steps=15)
     world.at = {step: lambda s=s: setattr(world, "time_s", world.time_s + s) for step, s in enumerate(stalls)}
 
@@ -342,14 +342,14 @@ def test_set_points_are_never_less_than_half_a_period_apart(stalls, works):
     assert ticks == sorted(set(ticks))
 
 
-def test_two_modules_run_with_the_same_loop():
+def test_loop_runs_with_two_modules():
     world = World(steps=5, robot=robot_file.load("pneumatic-2"))
     world.run()
     assert world.features[0].shape == (2, 3 * 3 + 1)
     assert len(world.ticks) == 5
 
 
-def test_a_rehearsal_runs_the_task_without_a_board():
+def test_dry_run_needs_no_board():
     world = World(steps=5)
     dataclasses.replace(world.loop, valves=DryRunBoard()).run(REST)
     assert world.sent == []
@@ -377,7 +377,7 @@ def test_summary_and_figures():
     assert "missed ticks: 0" in text
 
 
-def test_summary_of_a_run_that_never_began():
+def test_summary_without_steps():
     statistics = TickStatistics(ROBOT, 10)
     assert statistics.figures()["late_ms"] is None
     assert statistics.summary()[0] == "0 of 10 control steps"
@@ -397,7 +397,7 @@ def test_status_line():
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.sampled_from(["good", "good", "hidden", "slow", "stall"]), min_size=3, max_size=15))
-def test_whatever_happens_the_model_sees_what_an_episode_of_training_has(happens):
+def test_model_input_after_faults_equals_window_of_training(happens):
     """A held frame repeats the state; a step that sent nothing, or that was skipped, repeats the action."""
     world = World(steps=len(happens))
     rng = np.random.default_rng(len(happens))

@@ -12,7 +12,7 @@ from modsoft.runtime.log_record import Acknowledgement
 from modsoft.runtime.tracking.frame import LatestFrame
 
 
-def test_three_steps_in_a_row_that_are_too_late_to_send_end_the_run():
+def test_three_late_steps_in_succession_end_run():
     world = World(steps=20)
     world.work_s = PERIOD_S * 0.6
     with pytest.raises(Tripped, match="3 control ticks in a row"):
@@ -22,7 +22,7 @@ def test_three_steps_in_a_row_that_are_too_late_to_send_end_the_run():
     assert len(world.sent) == 1
 
 
-def test_set_points_that_took_long_to_send_delay_the_next():
+def test_slow_sending_delays_next_set_points():
     """A process that was halted while it sent them: the next ones follow half a period later at the earliest."""
     world = World(steps=6)
     world.work_s = 0.0
@@ -41,12 +41,12 @@ def test_set_points_that_took_long_to_send_delay_the_next():
     assert min(np.diff(ended_s)) == pytest.approx(PERIOD_S / 2)
 
 
-def test_acknowledgement_of_the_first_set_points_is_recorded():
+def test_acknowledgement_of_first_set_points_is_recorded():
     world = World(steps=2).run()
     assert world.ticks[0].acknowledged == Acknowledgement(-1, pytest.approx(7.0))
 
 
-def test_status_with_the_same_number_from_before_is_no_acknowledgement():
+def test_older_status_with_same_number_is_no_acknowledgement():
     world = World(steps=2)
     world.acknowledging = False
     world.status.acked_seq = 1  # that of the first set-points
@@ -61,7 +61,7 @@ def test_dry_run_counts_no_acknowledgement():
     assert world.tick_statistics.acknowledged_ms == []
 
 
-def test_tracker_without_any_frame_ends_the_run_at_the_third_step():
+def test_tracker_without_any_frame_ends_run_at_third_step():
     world = World(steps=20)
     world.tracked = False
     world.loop = dataclasses.replace(world.loop, frames=LatestFrame())
@@ -73,7 +73,7 @@ def test_tracker_without_any_frame_ends_the_run_at_the_third_step():
 
 @pytest.mark.parametrize("problem", ["", "no reply"])
 @pytest.mark.parametrize(("beyond_s", "lost"), [(-0.001, False), (0.0, False), (0.001, True)])
-def test_silence_of_the_tracker_is_noticed_half_a_slice_early(beyond_s, lost, problem):
+def test_silent_tracker_is_detected_half_slice_early(beyond_s, lost, problem):
     world = World()
     frames = LatestFrame()
     frames.put(dataclasses.replace(world.frame(), monotonic_s=0.0))
@@ -98,7 +98,7 @@ def test_records_have_times_in_milliseconds():
     assert [record.board.supply_v for record in world.ticks] == pytest.approx([4.98] * 4)
 
 
-def test_warm_up_gets_the_time_left_and_the_duration_of_each_step():
+def test_warm_up_gets_time_left_and_duration_of_each_step():
     class WarmUp:
         before_calls, steps_s = [], []
 

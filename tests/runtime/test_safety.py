@@ -218,7 +218,7 @@ def test_robot_as_fast_as_its_limits_allow_is_no_jump():
         assert check.good, check
 
 
-def test_frozen_tracker_is_found_within_three_ticks_whatever_the_phase():
+def test_frozen_tracker_is_detected_within_three_ticks_at_any_phase():
     for phase_s in np.linspace(0.0, PERIOD_S, 9):
         validator, held = settled(), frame(6000 + round(60 * phase_s), 100.0 + phase_s)
         statuses = [validator.check(held, 100.0 + phase_s + 0.01 + k * PERIOD_S).status for k in range(3)]
