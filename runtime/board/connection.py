@@ -38,6 +38,7 @@ MISSED_ACKS = 3
 RETRY_S = 0.05
 RETRIES = 3
 HEARTBEAT_S = HEARTBEAT_PERIOD_MS / 1000
+TICK_MASK = 0xFFFFFFFF
 
 
 class Phase(Enum):
@@ -84,6 +85,7 @@ class Connection:
         self._parser = Parser()
         self._heartbeat_due = now
         self._board_session = 0
+        self._board_tick = self._first_tick = 0  # the board's last one, and its one at the start of the session
         self._seq = 0
         self._set: tuple[int, Set] | None = None
         self._unacked: dict[int, float] = {}
@@ -105,6 +107,8 @@ class Connection:
         assert self.hello is not None
         self.refused = None
         self.armed = False
+        # The board refuses a tick before its last one, which is that of an earlier session.
+        self.tick, self._first_tick = 0, self._board_tick
         session = self._board_session % 255 + 1
         self._request = _Request(Arm(PROTOCOL_HASH, self.hello.boot_id, session, channels, p_full), RETRIES)
 
@@ -178,7 +182,8 @@ class Connection:
             self._lose(f"the board restarted by itself (reset cause {cause})", now)
 
     def _on_status(self, status: Status, frame: WireFrame, now: float) -> None:
-        self.status, self.status_at = status, now
+        self._board_tick = status.tick
+        self.status, self.status_at = status._replace(tick=(status.tick - self._first_tick) & TICK_MASK), now
         if self.hello is None:  # in LOST, a status has no effect
             return
         if status.boot_id != self.hello.boot_id:
@@ -242,15 +247,19 @@ class Connection:
             self._set = None
             self._unacked[seq] = now
             self.counts["sets"] += 1
-            out += encode(message, seq, self.session)
+            out += encode(message._replace(tick=self._on_wire(message.tick)), seq, self.session)
         # While an ARM is pending, the session number for a heartbeat is unknown.
         arming = self._request is not None and isinstance(self._request.message, Arm)
         if now >= self._heartbeat_due and not arming:
             if self.heartbeats_since is None or now - self._heartbeat_due > HEARTBEAT_S:
                 self.heartbeats_since = now  # the board restarts its count after a gap
             self._heartbeat_due = max(self._heartbeat_due + HEARTBEAT_S, now)
-            out += encode(Heartbeat(self.tick), 0, self.session)
+            out += encode(Heartbeat(self._on_wire(self.tick)), 0, self.session)
         return out
+
+    def _on_wire(self, tick: int) -> int:
+        """The board's tick of a tick of this session."""
+        return (self._first_tick + tick) & TICK_MASK
 
     def _check_timeouts(self, now: float) -> None:
         for seq, sent in list(self._unacked.items()):

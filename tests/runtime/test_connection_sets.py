@@ -153,3 +153,31 @@ def test_names_of_faults_and_refusals():
     assert fault_names(0x8001) == "LINK_TIMEOUT, 0x8000"
     assert refusal(Nack(0x10, 0, NackReason.SEQUENCE)) == "sequence"
     assert refusal(Nack(0x10, 0, 200)) == "reason 200"
+
+
+def test_ticks_of_a_second_session_follow_those_of_the_first(connection):
+    """The board refuses a tick before its last one."""
+    assert connection.status.tick == 0
+    connection.feed(encode(RUNNING._replace(tick=40), session=9), 0.1)
+    assert connection.status.tick == 40
+    for _ in range(2):  # a refused request is repeated
+        connection.arm(0x3F, 30000)
+    assert connection.tick == 0
+    connection.poll(0.2)
+    connection.feed(encode(RUNNING._replace(tick=40), session=10), 0.2)
+    assert connection.status.tick == 0
+    seq = connection.set(Set(3, ZERO))
+    assert frames(connection.poll(0.3)) == [(seq, 10, Set(43, ZERO)), (0, 10, Heartbeat(43))]
+    connection.feed(encode(RUNNING._replace(tick=43), session=10), 0.3)
+    assert connection.status.tick == 3
+
+
+def test_ticks_go_round_after_the_largest(connection):
+    connection.feed(encode(RUNNING._replace(tick=0xFFFFFFFF), session=9), 0.1)
+    connection.arm(0x3F, 30000)
+    connection.poll(0.2)
+    connection.feed(encode(RUNNING._replace(tick=0xFFFFFFFF), session=10), 0.2)
+    seq = connection.set(Set(2, ZERO))
+    assert (seq, 10, Set(1, ZERO)) in frames(connection.poll(0.3))
+    connection.feed(encode(RUNNING._replace(tick=1), session=10), 0.3)
+    assert connection.status.tick == 2
