@@ -20,14 +20,14 @@ import numpy as np
 
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.errors import ModelError
+from modsoft.runtime.robot import Robot
 from modsoft.training import plotting
 from modsoft.training.data import dataset
+from modsoft.training.data.workspace import CUBE, SQUARE
 from modsoft.training.simulation.parameters import PARAMETERS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-CUBE, SQUARE = 1 / 4, 1 / 25  # edge over the module's length: with random data few cells are empty at that size
 
 
 @dataclass(frozen=True)
@@ -83,22 +83,37 @@ def compare(paths: list[Path]) -> list[Coverage]:
     """The coverage of each data set, at the number of samples of the smallest; `ModelError` for robots of different
     kinds or numbers of modules."""
     sets = [dataset.read(path) for path in paths]
-    robots = {(data.robot.preset, data.robot.modules) for data in sets}
+    robots = {(_kind(data.robot), data.robot.modules) for data in sets}
     if len(robots) > 1:
         different = ", ".join(sorted(f"{kind} with {modules} modules" for kind, modules in robots))
         raise ModelError(f"data sets of different robots ({different}); plot them one by one")
-    kind, modules = robots.pop()
-    length_m = PARAMETERS[kind].module_length_m
+    length_m = _module_length_m(sets[0], paths[0])
     samples = min(data.samples for data in sets)
     coverages = []
     for path, data in zip(paths, sets, strict=True):
         planar = data.robot.motion == "planar"
-        reached = data.configuration[:, 1:].reshape(-1, modules, 3)
+        reached = data.configuration[:, 1:][data.recorded]
         evenly = np.linspace(0, len(reached) - 1, samples).round().astype(np.int64)
         positions = module_ends(reached[evenly], length_m)
         strategy = str(data.generation["strategy"])
         coverages.append(Coverage(path.name, strategy, planar, positions, covered(positions, length_m, planar)))
     return coverages
+
+
+def _kind(robot: Robot) -> str:
+    return robot.name if robot.simulation is None else robot.preset
+
+
+def _module_length_m(data: dataset.DataSet, path: Path) -> float:
+    """Length of a module: as measured, or else that of the simulated robot."""
+    measured = data.generation.get("module_length_m")
+    if isinstance(measured, float) and 0.0 < measured < 100.0:
+        return measured
+    if data.robot.simulation is None:
+        raise ModelError(
+            f"{path}: the length of a module is not known; give [simulation] in the robot file, and import it again"
+        )
+    return PARAMETERS[data.robot.preset].module_length_m
 
 
 def line(coverage: Coverage) -> str:

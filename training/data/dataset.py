@@ -3,6 +3,12 @@
     configuration   (E, K + 1, N, 3) [v_x, v_y, v_z], row 0 at rest, row t + 1 reached by the action of row t
     action          (E, K, N, A) in [-1, 1]
 
+Of a real robot (`source` in the generation settings is one of `dataset_checks.MEASURED`) a gap is rows of NaN: steps
+that were not recorded, which end an episode in the middle of the array; no window extends over a gap. Optional there:
+
+    poses           (E, K + 1, N + 1, 4, 4) of the tracker's tools, as measured, base first; positions in mm
+    time_s          (E, K + 1) when the tracker measured them, s: since 1970 (UTC), or of the emulated clock
+
 Attributes: `schema` (3); `generation` (JSON: the settings that all numbers depend on; at least `robot`, the robot file
 as plain values, and `strategy`, text; `simulator` and `simulator_sha256`, name and parameters, for simulated data);
 `stage_borders` (stages + 1 steps, 0 to K); `rejected` (episodes that diverged and were replaced; 0 for a real robot).
@@ -35,13 +41,14 @@ from modsoft.training.data import dataset_checks as checks
 from modsoft.training.data.hdf5 import own_array
 
 SCHEMA = 3  # 2: with another state of planar modules; 1: with other names, too
+ARRAYS = ("configuration", "action", "poses", "time_s")
 # Training, validation and test part have 70, 10 and 20 %, as in the paper; the second and third begin here.
 VALIDATION_FROM, TEST_FROM = 0.7, 0.8
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """Episodes of one robot, all of the same length and each from rest."""
+    """Episodes of one robot, all of the same length and each from rest, or with gaps (see above)."""
 
     generation: dict[str, Any]  # schema, robot, strategy, seed, steps, period_s, simulator, code_version, ...
     configuration: Array  # (E, K + 1, N, 3)
@@ -55,8 +62,14 @@ class DataSet:
 
     @property
     def samples(self) -> int:
-        """Control steps in all episodes."""
-        return self.action.shape[0] * self.action.shape[1]
+        """Recorded control steps in all episodes."""
+        return int(self.recorded.sum())
+
+    @property
+    def recorded(self) -> NDArray[np.bool_]:
+        """Steps (E, K) that are no gap: with their action, and the configurations before and after it."""
+        known, driven = (np.asarray(np.isfinite(each).all((2, 3))) for each in (self.configuration, self.action))
+        return known[:, :-1] & known[:, 1:] & driven
 
     def sha256(self) -> str:
         """Of settings and numbers; a model records it for each data set that it was trained on."""
@@ -75,6 +88,20 @@ class Episode(NamedTuple):
 
     def is_finite(self) -> bool:
         return bool(np.isfinite(self.configuration).all() and np.isfinite(self.action).all())
+
+
+class MeasuredEpisode(NamedTuple):
+    """One run of a real robot. Rows of NaN are gaps. poses and time_s: None where they are not known."""
+
+    configuration: Array  # (K + 1, N, 3)
+    action: Array  # (K, N, A)
+    poses: Array | None = None  # (K + 1, N + 1, 4, 4)
+    time_s: Array | None = None  # (K + 1,)
+    rejected: int = 0
+
+    def is_finite(self) -> bool:
+        """Whether all numbers outside gaps are finite."""
+        return not any(np.isinf(array).any() for array in (self.configuration, self.action))
 
 
 @dataclass(frozen=True)
@@ -100,7 +127,11 @@ def write(data: DataSet, path: Path) -> None:
 
 
 def join(
-    path: Path, generation: dict[str, Any], stage_borders: NDArray[np.int64], count: int, episodes: Iterable[Episode]
+    path: Path,
+    generation: dict[str, Any],
+    stage_borders: NDArray[np.int64],
+    count: int,
+    episodes: Iterable[Episode | MeasuredEpisode],
 ) -> Header:
     """`write` for `count` episodes from an iterator, one in memory at a time."""
     rejected = 0
@@ -108,13 +139,15 @@ def join(
         try:
             with h5py.File(temporary, "w") as file:
                 for index, episode in enumerate(episodes):
+                    arrays = {name: getattr(episode, name, None) for name in ARRAYS}
                     if index == 0:
-                        for name in ("configuration", "action"):
-                            file.create_dataset(name, (count, *getattr(episode, name).shape), np.float64)
+                        for name, array in arrays.items():
+                            if array is not None:
+                                file.create_dataset(name, (count, *array.shape), np.float64)
                     if not episode.is_finite():  # the last check; earlier ones keep such episodes away
                         raise ModelError(f"episode {index} is not finite; not written to {path}")
-                    file["configuration"][index] = episode.configuration
-                    file["action"][index] = episode.action
+                    for name in file:
+                        file[name][index] = arrays[name]
                     rejected += episode.rejected
                 file.attrs["schema"] = SCHEMA
                 file.attrs["generation"] = json.dumps(generation, sort_keys=True)
@@ -161,8 +194,10 @@ def read(path: Path) -> DataSet:
     with _opened(path) as (arrays, header):
         configuration, action = (np.asarray(arrays[name], np.float64) for name in ("configuration", "action"))
     data = DataSet(header.generation, configuration, action, header.stage_borders, header.rejected)
-    checks.configuration(configuration, data.robot.motion, path)
-    checks.action(action, path)
+    is_measured = header.generation.get("source") in checks.MEASURED
+    outside_gaps = checks.without_gaps if is_measured else lambda values, stand_in: values
+    checks.configuration(outside_gaps(configuration, [0.0, 0.0, 1.0]), data.robot.motion, path)
+    checks.action(outside_gaps(action, 0.0), path)
     return data
 
 
@@ -197,7 +232,7 @@ def split(data: DataSet, history: int, how: str, seed: int) -> tuple[Windows, Wi
     states = state_of(data.configuration, data.robot.motion)
     features = np.stack([episode_features(s, a, history) for s, a in zip(states, data.action, strict=True)])
     features, targets = features.astype(np.float32), data.action.astype(np.float32)
-    part = _shuffled_parts(data, seed) if how == "shuffled" else _block_parts(data, history)
+    part = _shuffled_parts(data, history, seed) if how == "shuffled" else _block_parts(data, history)
     chosen = [Windows(features[part == p], targets[part == p]) for p in range(3)]
     empty = [name for name, windows in zip(("training", "validation", "test"), chosen, strict=True) if not len(windows)]
     if empty:
@@ -207,10 +242,13 @@ def split(data: DataSet, history: int, how: str, seed: int) -> tuple[Windows, Wi
     return chosen[0], chosen[1], chosen[2]
 
 
-def _shuffled_parts(data: DataSet, seed: int) -> NDArray[np.int64]:
-    """Part (E, K) of every window: 0, 1 or 2."""
-    position = np.random.default_rng(seed).permutation(data.samples) / data.samples
-    return np.digitize(position, [VALIDATION_FROM, TEST_FROM]).reshape(data.action.shape[:2])
+def _shuffled_parts(data: DataSet, history: int, seed: int) -> NDArray[np.int64]:
+    """Part (E, K) of every window: 0, 1 or 2; -1 for dropped ones."""
+    recorded = data.recorded
+    part = np.full(recorded.shape, -1)
+    position = np.random.default_rng(seed).permutation(data.samples) / max(1, data.samples)
+    part[recorded] = np.digitize(position, [VALIDATION_FROM, TEST_FROM])
+    return np.where(_same_back(recorded, history), part, -1)
 
 
 def _block_parts(data: DataSet, history: int) -> NDArray[np.int64]:
@@ -219,14 +257,19 @@ def _block_parts(data: DataSet, history: int) -> NDArray[np.int64]:
     Each stage is cut on its own, with its pieces of all episodes in a row. So every part has the same fraction of every
     stage, with one long run of a real robot as with many short simulated ones.
     """
-    episodes, steps = data.action.shape[:2]
-    borders = data.stage_borders
-    stage = np.searchsorted(borders, np.arange(steps), side="right") - 1
-    length = np.diff(borders)[stage]
-    position = (np.arange(episodes)[:, None] * length + np.arange(steps) - borders[stage]) / (episodes * length)
-    part = np.digitize(position, [VALIDATION_FROM, TEST_FROM])
-    # The window of step t extends back to the action of step t - history.
-    is_whole = np.ones_like(part, dtype=bool)
+    recorded = data.recorded
+    part = np.full(recorded.shape, -1)
+    for begin, end in itertools.pairwise(data.stage_borders):
+        in_stage = recorded[:, begin:end]
+        position = (np.cumsum(in_stage).reshape(in_stage.shape) - 1) / max(1, in_stage.sum())
+        part[:, begin:end] = np.where(in_stage, np.digitize(position, [VALIDATION_FROM, TEST_FROM]), -1)
+    return np.where(_same_back(part, history), part, -1)
+
+
+def _same_back(values: NDArray[Any], history: int) -> NDArray[np.bool_]:
+    """Whether the value of a step (E, K) is that of all steps of its window, which extends back to the action of step
+    t - history, or to the start of the episode at rest."""
+    same = np.ones(values.shape, dtype=bool)
     for back in range(1, history + 1):
-        is_whole[:, back:] &= part[:, back:] == part[:, :-back]
-    return np.where(is_whole, part, -1)
+        same[:, back:] &= values[:, back:] == values[:, :-back]
+    return same

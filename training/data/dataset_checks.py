@@ -31,6 +31,11 @@ ATTRIBUTES = {
 SCHEMA_1 = {"recipe": "generation", "redrawn": "rejected"}  # words: old names
 SCHEMA_1_SETTINGS = {"plant": "simulator", "plant_sha256": "simulator_sha256"}
 LENGTH_TOLERANCE = 1e-3  # of a unit vector: allows half precision and numbers with four decimals
+MEASURED = (
+    "robot",
+    "rig",
+    "import",
+)  # sources of data that may have gaps: a real robot, the emulated rig, a lab's file
 RANGE_TOLERANCE = 1e-6  # of an action beyond [-1, 1]: allows the rounding of single precision
 
 
@@ -125,6 +130,12 @@ def shapes(configuration: tuple[int, ...], action: tuple[int, ...], robot: robot
         if shape != expected or 0 in shape:
             full_shape = f"{expected}" if 0 not in expected else in_words.format(0, robot.modules, robot.action_size)
             raise ModelError(f"{where}: {name} has the shape {shape}, expected {full_shape} for robot {robot.name}")
+
+
+def without_gaps(values: Array, stand_in: Any) -> Array:
+    """A copy of values (E, K, N, ...) with `stand_in` in each row of NaN, for the checks."""
+    gaps = np.isnan(values).all(axis=(2, 3), keepdims=True)
+    return np.where(gaps, stand_in, values)
 
 
 def configuration(values: Array, motion: str, where: Path) -> None:
