@@ -27,12 +27,13 @@ from modsoft.runtime.control.controller import Control
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, ModsoftError, RobotFileError, UsageError
 from modsoft.runtime.files import read_text
 from modsoft.runtime.log import RunLog
+from modsoft.runtime.log_record import Record
 from modsoft.runtime.loop import Loop
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.safety import FrameValidator, check_rest
 from modsoft.runtime.shutdown import finish
 from modsoft.runtime.statistics import TickStatistics
-from modsoft.runtime.stop import Keys, Signals, Stop
+from modsoft.runtime.stop import Keys, Paused, Signals, Stop
 from modsoft.runtime.terminal import StatusLine
 from modsoft.runtime.tracking.frame import LatestFrame
 from modsoft.runtime.tracking.reader import Reader
@@ -72,7 +73,7 @@ class DeviceSetup:
 
 def read_setup(options: DeviceOptions) -> DeviceSetup:
     """Reads and checks robot file and calibration; finds the board's port."""
-    robot, robot_text, folder = _robot(options)
+    robot, robot_text, folder = read_robot(options)
     port = ""
     if not options.dry_run:
         if robot.tracker.source == "replay":
@@ -157,31 +158,55 @@ class Devices:
         log: RunLog,
         statistics: TickStatistics,
         warm_up: bool = False,
+        observe: Callable[[Record], None] = lambda record: None,
         status: Callable[[], str] = lambda: "",
         set_points_bar: Callable[[Array], Array] | None = None,
+        pausable: bool = False,
     ) -> None:
         """One run: arms the board, runs the loop for the steps of `desired` (see `Loop`), vents, closes the log.
 
-        control: called with the configuration (N, 3) at rest. status: text at the beginning of the status line.
-        set_points_bar: see `Loop`. Returns after the last step, when the board has confirmed the venting (or after a
-        dry run); raises what ended it earlier.
+        control: called with the configuration (N, 3) at rest. observe: called with each record after it was logged.
+        status: text at the beginning of the status line. set_points_bar: see `Loop`. pausable: the pause key ends the
+        run with `Paused`. Returns after the last step, when the board has confirmed the venting (or after a dry run);
+        raises what ended it earlier.
         """
         error: BaseException | None = None
-        self._keys = Keys(self.stop)
+        self._keys = Keys(self.stop, pausable)
+
+        def put(record: Record) -> None:
+            log.put(record)
+            observe(record)
+
         with ExitStack() as exits:
             try:
                 exits.enter_context(self._keys)
                 with StatusLine(lambda: status() + _status(statistics, log), sys.stderr):
-                    self._control(control, desired, log, statistics, warm_up, set_points_bar)
+                    self._control(control, desired, put, statistics, warm_up, set_points_bar)
             except BaseException as raised:  # noqa: BLE001 - raised again after the venting
                 error = raised
             finish(self.board, log, statistics, self.frames, error)
+
+    def wait_for_resume(self) -> None:
+        """After `Paused`: waits for the pause key. Another request, also one that came after the pause, is raised."""
+        self._new_stop()
+        with Keys(self.stop, pausable=True):
+            while self.stop.error is None:
+                self.wait(0.2)
+        self._new_stop()
+
+    def _new_stop(self) -> None:
+        """Replaces the request of a pause; raises any other one. Signals go to the new one first, so that none is
+        lost."""
+        before, self.stop = self.stop, Stop()
+        self.signals.stop = self.stop
+        if not isinstance(before.error, Paused):
+            before.check()
 
     def _control(
         self,
         control: Callable[[Array], Control],
         desired: Array,
-        log: RunLog,
+        log: Callable[[Record], None],
         statistics: TickStatistics,
         warm_up: bool,
         set_points_bar: Callable[[Array], Array] | None,
@@ -201,9 +226,9 @@ class Devices:
             board or DryRunBoard(),
             Ticker(robot.loop.period_s, self.now, self._wait or spinning(self.stop.wait)),
             self.stop,
-            log.put,
+            log,
             statistics,
-            WarmUp(robot, validator, log.put) if warm_up else None,
+            WarmUp(robot, validator, log) if warm_up else None,
             set_points_bar,
         ).run(rest)
 
@@ -231,7 +256,7 @@ def confirm(
         raise UsageError("found standard input closed, expected Enter; give --yes")
 
 
-def _robot(options: DeviceOptions) -> tuple[Robot, str, Path]:
+def read_robot(options: DeviceOptions) -> tuple[Robot, str, Path]:
     """The robot with the options applied, the text of its file, and the folder that its paths are relative to."""
     path = Path(options.robot)
     if not path.is_file() and options.robot == "robot.toml":
@@ -242,7 +267,7 @@ def _robot(options: DeviceOptions) -> tuple[Robot, str, Path]:
     robot = robot_file.load(options.robot)
     if robot.valve is None:
         raise RobotFileError(
-            f"robot {robot.name} has no [valve], so it is only simulated (modsoft-simulate); modsoft-runtime drives "
+            f"robot {robot.name} has no [valve], so it is only simulated (modsoft-simulate); this command drives "
             "robots with chambers"
         )
     if options.tracker:

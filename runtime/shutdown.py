@@ -10,7 +10,7 @@ from modsoft.runtime.errors import INTERNAL_EXIT_CODE, LostInRun, ModsoftError, 
 from modsoft.runtime.log import RunLog
 from modsoft.runtime.log_record import EndRecord
 from modsoft.runtime.statistics import TickStatistics
-from modsoft.runtime.stop import StopKey
+from modsoft.runtime.stop import Paused, StopKey
 from modsoft.runtime.terminal import say
 from modsoft.runtime.tracking.frame import LatestFrame
 
@@ -29,8 +29,9 @@ def finish(
             residual_bar = board.residual_pressures_bar() if vented else {}
         except Exception as failure:  # noqa: BLE001 - the log must still be closed; the board's own timer vents
             error = error or failure
-        if not vented and error is None:
-            error = LostInRun("the task is done, but the board did not confirm the venting; look at the pressures")
+        if not vented and (error is None or isinstance(error, Paused)):
+            what = "the task is done" if error is None else "the run is paused"
+            error = LostInRun(f"{what}, but the board did not confirm the venting; look at the pressures")
     if residual_bar:
         error = _stuck(residual_bar, error)
     code, reason = 0, "done"

@@ -17,6 +17,7 @@ from modsoft.runtime.locks import system_module
 from modsoft.runtime.terminal import TerminalThread
 
 STOP_KEYS = (" ", "q", "\x1b")  # space, q, Esc
+PAUSE_KEY = "p"
 # SIGHUP does not exist on Windows.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
@@ -33,6 +34,12 @@ class StopKey(Tripped):
     """The operator pressed a stop key."""
 
 
+class Paused(ModsoftError):
+    """The operator pressed the pause key, to go on later. Any other request replaces this one."""
+
+    exit_code = 0
+
+
 class Stop:
     """The stop request of a run. The loop sleeps in `wait`, which a request ends."""
 
@@ -42,7 +49,7 @@ class Stop:
 
     def request(self, error: ModsoftError) -> None:
         """Requests the end of the run; only the first reason is kept."""
-        if self.error is None:
+        if self.error is None or isinstance(self.error, Paused):
             self.error = error
         self._event.set()
 
@@ -63,7 +70,7 @@ class Signals:
     """
 
     def __init__(self, stop: Stop, leave: Callable[[int], Any] = os._exit):
-        self._stop = stop
+        self.stop = stop
         self._leave = leave
         self._holding = False
         self._requested = False
@@ -91,18 +98,19 @@ class Signals:
                 self._leave(error.exit_code)
             return
         self._requested = True
-        self._stop.request(error)
+        self.stop.request(error)
         if not self._holding:
             raise error
 
 
 class Keys(TerminalThread):
-    """While entered, the stop keys of a terminal become requests. Does nothing if stdin is not a terminal, or one that
-    this process may not read."""
+    """While entered, the stop keys of a terminal become requests, and with `pausable` the pause key too. Does nothing
+    if stdin is not a terminal, or one that this process may not read."""
 
-    def __init__(self, stop: Stop):
+    def __init__(self, stop: Stop, pausable: bool = False):
         super().__init__("keys", end_wait_s=1.0)
         self._stop = stop
+        self._pausable = pausable
         self._restore: Callable[[], None] | None = None
 
     def _target(self) -> Callable[[], None] | None:
@@ -123,9 +131,12 @@ class Keys(TerminalThread):
 
     def _run(self, read: Callable[[], str]) -> None:
         while not self._done.is_set():
-            if read() in STOP_KEYS:
+            key = read()
+            if key in STOP_KEYS:
                 self._stop.request(StopKey("stop key pressed"))
                 return
+            if self._pausable and key == PAUSE_KEY:
+                self._stop.request(Paused("paused"))  # a stop key may follow
 
     def _posix(self, termios: Any, tty: Any) -> Callable[[], str] | None:
         if sys.stdin is None:  # closed by the parent process

@@ -11,7 +11,7 @@ from modsoft.runtime.errors import DeviceAbsent, LostInRun, ModelError, Tripped,
 from modsoft.runtime.log import RunLog
 from modsoft.runtime.safety import FrameValidator
 from modsoft.runtime.statistics import TickStatistics
-from modsoft.runtime.stop import Interrupted, StopKey
+from modsoft.runtime.stop import Interrupted, Paused, StopKey
 from modsoft.runtime.tracking.frame import LatestFrame
 
 ROBOT = robot_file.load("pneumatic-3")
@@ -146,3 +146,16 @@ def test_no_frame_is_waited_for_only_so_long():
     rig.frames.error = OSError("unplugged")
     with pytest.raises(DeviceAbsent, match="unplugged"):
         rig.rest(FrameValidator(ROBOT))
+
+
+def test_pause_without_confirmed_venting_is_an_error(tmp_path, capsys):
+    ending = Ending(tmp_path, capsys, Board(False), Paused("paused"))
+    assert isinstance(ending.raised, LostInRun)
+    assert "the run is paused, but the board did not confirm the venting" in str(ending.raised)
+
+
+def test_pause_vents_with_the_ramp(tmp_path, capsys):
+    board = Board(True)
+    ending = Ending(tmp_path, capsys, board, Paused("paused"))
+    assert isinstance(ending.raised, Paused)
+    assert board.modes == [VentMode.RAMP]

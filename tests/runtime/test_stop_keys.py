@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from modsoft.runtime.locks import system_module
-from modsoft.runtime.stop import Keys, Stop, StopKey
+from modsoft.runtime.stop import Keys, Paused, Stop, StopKey
 
 termios, tty = system_module("termios"), system_module("tty")
 posix = pytest.mark.skipif(termios is None, reason="no terminals of this kind on this system")
@@ -196,3 +196,31 @@ def test_system_without_terminal_modules_reads_no_key(monkeypatch):
     monkeypatch.setattr("modsoft.runtime.stop.system_module", {}.get)
     monkeypatch.setattr("sys.stdin", Terminal())
     assert no_key_is_read()
+
+
+# ---- Pause
+
+
+def test_pause_key_requests_a_pause_and_a_stop_key_after_it_the_end(terminal):
+    keyboard, _ = terminal
+    stop = Stop()
+    with Keys(stop, pausable=True) as keys:
+        keyboard.write(b"p")
+        stop.wait(10)
+        assert isinstance(stop.error, Paused)
+        keyboard.write(b"q")
+        keys._thread.join(10)
+    assert isinstance(stop.error, StopKey)
+
+
+def test_pause_key_is_another_key_where_nothing_can_pause(terminal):
+    keyboard, _ = terminal
+    stop = Stop()
+    with Keys(stop) as keys:
+        keyboard.write(b"pq")
+        keys._thread.join(10)
+    assert isinstance(stop.error, StopKey)
+    stop = Stop()
+    stop.request(StopKey("stop key pressed"))
+    stop.request(Paused("paused"))
+    assert isinstance(stop.error, StopKey)
