@@ -132,3 +132,22 @@ def channel_pressures_bar(robot: Robot, actuation: Array, channels: int = 12) ->
         pressure = pressures[chamber.module - 1][robot.actuator_of(chamber)]
         set_points[chamber.channel] = min(max(chamber.gain * pressure + chamber.offset_bar, 0.0), largest_bar)
     return np.array(set_points)
+
+
+def applied_actuation(robot: Robot, channels_bar: Array) -> Array:
+    """Actuation (N, A) of the pressures (channels,), bar, that the board commands to the valves: the inverse of
+    `channel_pressures_bar`. Below p_min_bar, as of vented chambers, an activation is 0."""
+    valve, used = robot.valve, np.zeros((robot.modules, len(robot.directions)))
+    if valve is None:
+        raise ValueError(f"robot {robot.name} has no valves")
+    for chamber in robot.chambers:
+        pressure = (channels_bar[chamber.channel] - chamber.offset_bar) / chamber.gain
+        used[chamber.module - 1, robot.actuator_of(chamber)] = pressure
+    return actuation_of_pressures(robot, used)
+
+
+def actuation_of_pressures(robot: Robot, pressures: Array) -> Array:
+    """Actuation (..., N, A) of chamber pressures (..., N, n), bar: the inverse of `pressures_bar`."""
+    assert robot.valve is not None
+    share = (np.asarray(pressures) - robot.valve.p_min_bar) / (robot.valve.p_max_bar - robot.valve.p_min_bar)
+    return np.clip(np.clip(share, 0.0, 1.0) @ np.array(robot.directions), -1.0, 1.0)

@@ -199,3 +199,46 @@ def test_limits_of_three_chambers_hold_together(step):
         assert np.abs(out - previous).max() <= step + 1e-12
         np.testing.assert_allclose(actuators.applied(out), out, atol=1e-15)
         previous = out
+
+
+def three_chambers():
+    """The robot with chambers at 0, 120 and 240 degrees, on nine channels, each with its own gain and offset."""
+    table = ROBOT.to_dict()
+    table["robot"]["motion"] = "spatial"
+    table["actuators"]["directions_deg"] = [0, 120, 240]
+    table["simulation"] = None
+    table["chambers"] = [
+        {
+            "module": i // 3 + 1,
+            "direction_deg": i % 3 * 120,
+            "channel": 8 - i,
+            "gain": 0.8 + 0.02 * i,
+            "offset_bar": 0.01,
+        }
+        for i in range(9)
+    ]
+    return robot_file.from_dict(table)
+
+
+@pytest.mark.parametrize("robot", [ROBOT, three_chambers()], ids=["pair", "three"])
+def test_actuation_is_recovered_from_the_set_points(robot):
+    every_module = actuation.module_actuators(robot.directions)
+    for action in random_actions(60, robot.action_size).reshape(20, 3, -1):
+        applied = every_module.applied(action)
+        found = actuation.applied_actuation(robot, actuation.channel_pressures_bar(robot, applied))
+        np.testing.assert_allclose(found, applied, atol=1e-12)
+
+
+def test_vented_chambers_are_actuation_0():
+    assert np.array_equal(actuation.applied_actuation(ROBOT, np.zeros(12)), np.zeros((3, 1)))
+
+
+def test_pressure_below_the_set_point_is_a_smaller_actuation():
+    bar = actuation.channel_pressures_bar(ROBOT, np.array([[1.0], [0.0], [0.0]]))
+    bar[ROBOT.chambers[0].channel] = 0.215
+    assert actuation.applied_actuation(ROBOT, bar)[0, 0] == pytest.approx(0.5)
+
+
+def test_robot_without_valves_has_no_applied_actuation():
+    with pytest.raises(ValueError, match="cable-4 has no valves"):
+        actuation.applied_actuation(robot_file.load("cable-4"), np.zeros(12))
