@@ -160,7 +160,17 @@ def _robot(data: Sequence[DataSet]) -> dict[str, Any]:
                 f"data sets of different robots, {data[0].robot.name} and {each.robot.name} (or of one with other "
                 "limits or another rate); a model is trained on data of one robot"
             )
+        if source_of(each) != source_of(data[0]):
+            raise ModelError(
+                f"data of {source_of(data[0])} and of {source_of(each)}; a model is trained on data of one source"
+            )
     return data[0].robot.to_dict()
+
+
+def source_of(data: DataSet) -> str:
+    """Where the numbers come from, in words."""
+    sources = {"robot": "a real robot", "import": "a real robot", "rig": "the emulated rig"}
+    return sources.get(str(data.generation.get("source")), "a simulated robot")
 
 
 def _finished(out: Path, resume: Path, identity: dict[str, Any], settings: Settings) -> dict[str, Any]:

@@ -361,6 +361,16 @@ def test_several_data_sets_of_one_robot_train_one_model(tmp_path):
     assert swapped["data_sha256"] != trained["data_sha256"]
 
 
+def test_data_of_a_simulated_and_of_a_real_robot_are_refused_together(tmp_path):
+    real, imported = make(), make(seed=1)
+    real.generation["source"], imported.generation["source"] = "robot", "import"
+    with pytest.raises(
+        ModelError, match="data of a simulated robot and of a real robot; a model is trained on data of"
+    ):
+        train.train([make(), real], tmp_path / "m.pt", SMALL)
+    assert train.train([real, imported], tmp_path / "m.pt", SMALL)["provenance"]["samples"] == 600
+
+
 def test_data_sets_of_different_robots_are_refused(tmp_path):
     other = make()
     other.generation["robot"]["limits"]["largest_actuation_step"] = 0.9
