@@ -132,6 +132,8 @@ def _stream_error(error: OSError) -> OutputError:
 
 def _missing_extra(command: click.Command, error: ModuleNotFoundError) -> ModsoftError | None:
     package, extra = (error.name or "").split(".")[0], EXTRAS.get(command.name or "")
+    if command.name == "modsoft-collect" and package in ("h5py", "tqdm"):
+        extra = "collect"  # enough for the real robot
     if package not in OPTIONAL_PACKAGES or extra is None:
         return None
     return DeviceAbsent(f"no package {package}; install the extra {extra!r}: pip install '.[{extra}]' in the checkout")
