@@ -37,7 +37,7 @@ class MatrixTest(NamedTuple):
     @property
     def rows(self) -> set[int]:
         """The rows that its name states."""
-        function, _, parameter = self.node.rpartition("::")[2].partition("[")
+        function, _, parameter = self.node.partition("::")[2].partition("[")
         named = re.search(r"test_rows?_(\d\d)(?:_to_(\d\d)|((?:_\d\d)*))", function)
         if named is None:
             return set()

@@ -182,6 +182,7 @@ def test_folder_without_a_commit_is_refused(full, tmp_path):
         ("a.py::test_rows_01_to_04_emulated[x]", {1, 2, 3, 4}),
         ("a.py::test_row_11_stands_still[control thread stuck, the port's thread]", {11}),
         ("a.py::test_the_page", set()),
+        ("a.py::test_the_page[b.py::test_row_07_port]", set()),
     ],
 )
 def test_rows_are_read_from_the_name(full, node, rows):
