@@ -10,8 +10,8 @@
 #endif
 
 #define INPUTS PROTOCOL_CHANNELS
-/* Once in ROUNDS_PER_SUPPLY rounds, after the last input, the supply is measured, as the full scale at which the 1.1 V
- * reference is read. The reference settles slowly after it is selected, so its first conversion is discarded. */
+/* After the last input, once in ROUNDS_PER_SUPPLY rounds, the 1.1 V reference is read, from which the supply (the full
+ * scale) follows. The reference settles slowly after it is selected, so its first conversion is discarded. */
 #define SETTLING INPUTS
 #define SUPPLY (INPUTS + 1)
 #define ROUNDS_PER_SUPPLY 8 /* twice in SUPPLY_MS with 6 sensors, once with 12 */
