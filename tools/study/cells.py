@@ -9,12 +9,13 @@ import numpy as np
 
 from modsoft.study.results import Record
 
-NETWORK_TARGET = 0.5  # of the paper's error: target of the network alone
-CORRECTED_TARGET, ORACLE_TARGET = 0.1, 1.1  # of the paper's and of the oracle error: target with correction, the larger
+NETWORK_TARGET = 0.5  # of the network alone, as a fraction of the paper's error
+# With the correction, as fractions of the paper's and of the oracle error; the larger of both is the target.
+CORRECTED_TARGET, ORACLE_TARGET = 0.1, 1.1
 
 
 class Cell(NamedTuple):
-    """One error over the seeds: mean, smallest and largest mean of a seed, and mean of the seeds' deviations."""
+    """One error over the seeds: mean, smallest and largest mean of a seed, and mean of their standard deviations."""
 
     mean: float
     least: float
@@ -54,7 +55,7 @@ def ratio(ours: Cell | None, theirs: Cell | None) -> str:
 
 
 def target(paper: Cell, oracle: Cell | None, corrected: bool) -> float:
-    """The largest mean error that meets the target of a cell, in the paper's unit."""
+    """The target of a cell: the largest mean error that meets it, in the unit of the paper's."""
     if not corrected:
         return NETWORK_TARGET * paper.mean
     return max(CORRECTED_TARGET * paper.mean, ORACLE_TARGET * oracle.mean if oracle else 0.0)

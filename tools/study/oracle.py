@@ -1,4 +1,4 @@
-"""The stage that finds the oracle errors: the smallest errors that any sequence of actions is known to reach."""
+"""The stage of the oracle errors: the smallest errors that any sequence of actions is known to reach."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from modsoft.training import made_from
 from modsoft.training.simulation.fleet import simulated
 from modsoft.training.simulation.rollout import Rollout, rollout
 
-STEP_S = 0.35  # estimate for a control step of four modules on one core
+STEP_S = 0.35  # estimated seconds for a control step of four modules on one core
 
 
 def oracle_stage(plan: Plan, folder: Folder, jobs: int) -> Stage:
-    """oracle/*.npz, each stored as a run: the robot's motion under the best actions found."""
+    """oracle/*.npz, each stored as a run: the robot's motion under the optimised actions."""
     missing = [
         each
         for each in plan.oracle_errors
@@ -29,6 +29,7 @@ def oracle_stage(plan: Plan, folder: Folder, jobs: int) -> Stage:
 
 
 def oracle_s(plan: Plan, task_and_modules: tuple[str, int]) -> float:
+    """Estimated seconds on one core."""
     return (plan.steps or 250) * STEP_S * (task_and_modules[1] / 4) ** 2
 
 

@@ -1,4 +1,4 @@
-"""The folder of a study: every file in it is named by what it holds."""
+"""The folder of a study and the names of its files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from modsoft.runtime.errors import UsageError
 from modsoft.runtime.files import make_folder
 from modsoft.study.plan import Model, Run
 
-# What numpy raises for a file that is damaged or holds no arrays.
+# Errors of numpy for a file that is damaged or holds no arrays.
 NOT_READABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,13 +74,14 @@ class Plan:
 
 def models(seeds: tuple[int, ...]) -> tuple[Model, ...]:
     """All three networks on the paper's data in both splits; the biLSTM on the rich data, split in blocks."""
-    kinds = [(*MAIN, "blocks")]  # first, since it takes the longest
+    kinds = [(*MAIN, "blocks")]  # first, because it takes the longest
     kinds += [(network, "paper", split) for network in ("module-lstm", "lstm", "bilstm") for split in SPLITS]
     return tuple(Model(*kind, seed) for kind in kinds for seed in seeds)
 
 
 def runs(trained: tuple[Model, ...], numbers: tuple[int, ...]) -> tuple[Run, ...]:
-    """Tables 2 and 3, the other module `numbers` and the perturbations, by the models split in blocks."""
+    """The runs of Tables 2 and 3, of other `numbers` of modules, and with perturbations, by the models whose data were
+    split in blocks."""
     controllers = [model for model in trained if model.split == "blocks" and model.network != "module-lstm"]
     chosen = []
     for model in controllers:
@@ -89,7 +91,8 @@ def runs(trained: tuple[Model, ...], numbers: tuple[int, ...]) -> tuple[Run, ...
             for task in TASKS:
                 chosen += [Run(model, task, each, correction) for each in modules]
                 if main:
-                    chosen += [Run(model, task, each, correction, how) for each in (4, 6) for how in PERTURBATIONS]
+                    perturbed = itertools.product((4, 6), PERTURBATIONS)
+                    chosen += [Run(model, task, each, correction, perturbation) for each, perturbation in perturbed]
     return tuple(chosen)
 
 
@@ -124,7 +127,7 @@ def full() -> Plan:
 
 
 def quick() -> Plan:
-    """A miniature of the study that tests the command; its numbers have no meaning."""
+    """A miniature of the study, for tests of the command; its numbers have no meaning."""
     trained = models(seeds=(0,))
     sets = tuple(Data(each.name, 8 * 60, each.strategy, each.seed, steps=60) for each in (PAPER, TRADITIONAL, *RICH))
     small = {"batch": 32, "iterations": 60, "layers": 2, "hidden": 16}

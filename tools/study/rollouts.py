@@ -37,7 +37,7 @@ MODULES = [
     "modsoft.training.simulation.fleet",
     "modsoft.study.perturbations",
 ]
-STEP_S = 4e-3  # estimate for a control step of one robot of four modules on one core
+STEP_S = 4e-3  # estimated seconds for a control step of one robot of four modules on one core
 
 
 class StoredRun(NamedTuple):
@@ -61,11 +61,12 @@ def rollout_stage(plan: Plan, folder: Folder, jobs: int) -> Stage:
 
 
 def rollout_s(plan: Plan, batch: Sequence[Run]) -> float:
+    """Estimated seconds on one core; fewer than eight robots take as long as eight, a vector of the kernel."""
     return (plan.steps or 250) * STEP_S * batch[0].modules / 4 * max(8, len(batch))
 
 
 def _by_robot(runs: Sequence[Run]) -> list[list[Run]]:
-    """The runs of each simulated robot, which can run in one fleet."""
+    """The runs grouped by their simulated robot: those of a group can run in one fleet."""
 
     def robot_of(run: Run) -> tuple[int, str]:
         return run.modules, repr(perturbations.robot_properties(run.perturbation, run.modules, run.model.seed))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 from modsoft.runtime.choices import CORRECTIONS
 from modsoft.study import paper
@@ -17,19 +17,26 @@ SPLIT_LABELS = {"blocks": "contiguous blocks", "shuffled": "shuffled windows"}
 CORRECTION_LABELS = {"none": "network alone", "integral": "with correction"}
 
 
-class Comparison(NamedTuple):
+@dataclass
+class Comparison:
     """A comparison with the paper. lines: Markdown; missed: a line for each missed target; met: number of met ones."""
 
-    lines: list[str]
-    missed: list[str]
-    met: int
+    lines: list[str] = field(default_factory=list)
+    missed: list[str] = field(default_factory=list)
+    met: int = 0
+
+    def target_columns(self, where: str, error: Cell | None, limit: float) -> list[str]:
+        """The columns "target" and "met" of a cell, which is counted as met or missed. A missing error misses it."""
+        if error and error.mean <= limit:
+            self.met += 1
+            return [f"{limit:.2f}", "yes"]
+        self.missed.append(f"{where}: {error.mean if error else float('nan'):.2f}, target {limit:.2f}")
+        return [f"{limit:.2f}", "**no**"]
 
 
 def estimation(records: Sequence[Record]) -> Comparison:
     """Table 1."""
-    lines: list[str] = []
-    missed: list[str] = []
-    met = 0
+    comparison = Comparison()
     of_table = pick(records, table="1", quantity=ESTIMATION)
     ours = pick(of_table, source="study")
     for network, data in networks_and_data(ours):
@@ -48,59 +55,59 @@ def estimation(records: Sequence[Record]) -> Comparison:
                 row += [each, ratio(each, known)]
             if has_target and known:
                 limit = target(known, None, False)
-                met, columns = _compare(f"Table 1, module {module}", cells["blocks"], limit, missed, met)
-                row += columns
+                row += comparison.target_columns(f"Table 1, module {module}", cells["blocks"], limit)
             rows.append(row)
-        lines += [f"**{NETWORK_LABELS[network]}, {data} data**", ""]
-        lines += table(heads + (["target", "met"] if has_target else []), rows)
-    return Comparison(lines, missed, met)
+        comparison.lines += [f"**{NETWORK_LABELS[network]}, {data} data**", ""]
+        comparison.lines += table(heads + (["target", "met"] if has_target else []), rows)
+    return comparison
 
 
 def control(records: Sequence[Record], number: str, modules: int) -> Comparison:
     """Table 2 or 3: a table for each network and task; two for task B, without its first steps and with all."""
-    lines: list[str] = []
-    missed: list[str] = []
-    met = 0
+    comparison = Comparison()
     of_table = pick(records, table=number, quantity=CONTROL, modules=modules)
-    ours = pick(of_table, source="study")
-    for network, data in networks_and_data(ours):
-        lines += [f"### {NETWORK_LABELS[network]}, trained on {data} data, {modules} modules", ""]
+    for network, data in networks_and_data(pick(of_table, source="study")):
+        comparison.lines += [f"### {NETWORK_LABELS[network]}, trained on {data} data, {modules} modules", ""]
         for task in TASKS:
             for skip in sorted({paper.skipped_steps(task), 0}, reverse=True):
                 of_task = pick(of_table, task=task, skipped_steps=skip)
-                theirs = pick(of_task, source="paper", network=network)
                 # Task B over all its steps is not in the paper's tables, so it has no target.
                 has_target = (network, data) == MAIN and skip == paper.skipped_steps(task)
                 steps = f", without the first {skip} steps" if skip else ", all steps" if task == "B" else ""
-                name = f"task {task}{steps}"
-                rows = []
-                for module in range(1, modules + 1):
-                    known, oracle = cell(theirs, module=module), cell(of_task, source="oracle", module=module)
-                    of_module = pick(of_task, source="study", network=network, data=data, module=module)
-                    row: list[object] = [module, known]
-                    for correction in CORRECTIONS:
-                        error = cell(of_module, correction=correction)
-                        row += [error, ratio(error, known)]
-                        if has_target and known:
-                            limit = target(known, oracle, correction != "none")
-                            where = f"Table {number}, {name}, module {module}, {CORRECTION_LABELS[correction]}"
-                            met, columns = _compare(where, error, limit, missed, met)
-                            row += columns
-                    row.append(f"{oracle.mean:.2f}" if oracle else "")
-                    rows.append(row)
-                heads = ["module", "paper"]
-                for correction in CORRECTIONS:
-                    heads += [CORRECTION_LABELS[correction], "ratio"] + (["target", "met"] if has_target else [])
-                lines += [f"**{name}**", "", *table([*heads, "oracle error"], rows)]
-    return Comparison(lines, missed, met)
+                where = f"Table {number}, task {task}{steps}"
+                rows = _task_table(comparison, of_task, network, data, modules, where, has_target)
+                comparison.lines += [f"**task {task}{steps}**", "", *rows]
+    return comparison
 
 
-def _compare(where: str, error: Cell | None, limit: float, missed: list[str], met: int) -> tuple[int, list[str]]:
-    """The number of met targets and the columns "target" and "met" of a cell; a missed one is added to `missed`."""
-    if error and error.mean <= limit:
-        return met + 1, [f"{limit:.2f}", "yes"]
-    missed.append(f"{where}: {error.mean if error else float('nan'):.2f}, target {limit:.2f}")
-    return met, [f"{limit:.2f}", "**no**"]
+def _task_table(
+    comparison: Comparison,
+    records: Sequence[Record],
+    network: str,
+    data: str,
+    modules: int,
+    where: str,
+    has_target: bool,
+) -> list[str]:
+    """The table of a task, a row for each module. records: of the task; where: names the table in missed targets."""
+    theirs = pick(records, source="paper", network=network)
+    rows = []
+    for module in range(1, modules + 1):
+        known, oracle = cell(theirs, module=module), cell(records, source="oracle", module=module)
+        ours = pick(records, source="study", network=network, data=data, module=module)
+        row: list[object] = [module, known]
+        for correction in CORRECTIONS:
+            error = cell(ours, correction=correction)
+            row += [error, ratio(error, known)]
+            if has_target and known:
+                place = f"{where}, module {module}, {CORRECTION_LABELS[correction]}"
+                row += comparison.target_columns(place, error, target(known, oracle, correction != "none"))
+        row.append(f"{oracle.mean:.2f}" if oracle else "")
+        rows.append(row)
+    heads = ["module", "paper"]
+    for correction in CORRECTIONS:
+        heads += [CORRECTION_LABELS[correction], "ratio"] + (["target", "met"] if has_target else [])
+    return table([*heads, "oracle error"], rows)
 
 
 def end_effector(records: Sequence[Record]) -> list[str]:
