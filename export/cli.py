@@ -9,6 +9,8 @@ import click
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import UsageError
 
+LABEL_WIDTH = 16
+
 
 @click.command("modsoft-export")
 @click.argument("model", type=click.Path(path_type=Path))
@@ -63,16 +65,16 @@ def cli(model: Path, out: Path | None, meta: Path | None, inspect: bool) -> None
     if description.network.modules is None and (skipped := set(parity.MODULES) - set(report.whole)):
         numbers = ", ".join(map(str, sorted(skipped)))
         click.echo(f"not compared for {numbers} modules: this network amplifies the rounding of float32 too much")
-    click.echo("  modules     " + "".join(f"{modules:>10}" for modules in report.whole))
-    for name, errors in (
-        ("one run", report.whole),
-        ("chain", report.chain),
-        ("sweep short", report.one_sweep_fewer),
+    click.echo(f"  {'modules':<{LABEL_WIDTH}}" + "".join(f"{modules:>10}" for modules in report.whole))
+    for label, errors in (
+        ("all in one run", report.whole),
+        ("one by one", report.chain),
+        ("one sweep fewer", report.one_sweep_fewer),
     ):
         if errors:
-            click.echo(f"  {name:<12}" + "".join(f"{error:>10.1e}" for error in errors.values()))
+            click.echo(f"  {label:<{LABEL_WIDTH}}" + "".join(f"{error:>10.1e}" for error in errors.values()))
     if report.one_sweep_fewer:
-        click.echo("  (sweep short: the chain without its last sweep, whose error must be large for a valid check)")
+        click.echo("  (one sweep fewer: one by one, without the last sweep; a large error shows that the check works)")
 
 
 main = entry(cli)

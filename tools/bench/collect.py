@@ -1,7 +1,7 @@
 """Speed of modsoft-collect: samples a second by the number of processes, and its memory.
 
 `python tools/bench/collect.py`. Every figure is of the whole command, its start and the joining of the file included,
-by the wall clock, so no other process should run. The memory is the largest of one of its processes.
+by the wall clock: run nothing else at the same time. The memory is that of the process with the largest.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from modsoft.study.cells import table
 from modsoft.training.data.backends import cores
 from modsoft.training.simulation import simulators
 
-# Runs the command line that follows and prints the largest memory (KiB) of itself and its processes.
-MEASURED = """
+# Runs modsoft-collect with the arguments that follow; prints the largest memory (KiB) of one of its processes.
+SCRIPT = """
 import resource, sys
 from modsoft.training.collect_cli import cli
 cli.main(sys.argv[1:], standalone_mode=False)
@@ -38,7 +38,7 @@ def collected(robot: str, samples: int, jobs: int) -> dict[str, Any]:
         arguments = ["--robot", robot, "--samples", str(samples), "--jobs", str(jobs), "--out", str(out)]
         start_s = time.perf_counter()
         done = subprocess.run(
-            [sys.executable, "-P", "-c", MEASURED, *arguments],
+            [sys.executable, "-P", "-c", SCRIPT, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             check=True,
