@@ -142,7 +142,7 @@ def _without_run(list_ports: bool, check: str | None, print_robot: str | None) -
 )
 @click.option(
     "--calibration",
-    metavar="FILE",
+    metavar="FILE|none",
     type=click.Path(path_type=Path),
     help="Calibration of the tools, written by modsoft-calibrate. [default: NAME.calibration.toml beside NAME.toml, "
     "the robot file]",

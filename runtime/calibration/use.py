@@ -15,6 +15,7 @@ from modsoft.runtime.tracking.ndi import checked_tools
 
 NONE_IN_USE = "no calibration: mounting errors of the tools are in every configuration; run modsoft-calibrate rest"
 OF_A_RUN = "calibration.toml"  # in the folder of a run
+NONE = Path("none")  # as the option: no calibration, although there may be a file
 
 
 @dataclass(frozen=True)
@@ -48,11 +49,12 @@ def used_by(
     """The calibration of `option`, else the file beside the robot file, or None if there is none. Recorded frames are
     corrected by the calibration in the folder of their run, if there is one.
 
-    tracker_port, tools: as for `open_source`. Raises `ModelError` for a calibration that does not fit.
+    tracker_port, tools: as for `open_source`; option: `NONE` for no calibration. Raises `ModelError` for a calibration
+    that does not fit.
     """
     replayed = robot.tracker.source == "replay"
     path = option or (_of_run(Path(tracker_port)) if replayed else file.path_for(robot_file))
-    if option is None and not path.is_file():
+    if option == NONE or (option is None and not path.is_file()):
         return None
     calibration = file.read(path)
     file.check(calibration, robot, None if replayed else hashes(robot, tools), path)

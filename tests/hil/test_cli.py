@@ -10,8 +10,9 @@ from modsoft.runtime.errors import InUse, OutputError, UsageError
 class Interrupted:
     """A rig that is interrupted by Ctrl-C after it has written its files."""
 
-    def __init__(self, robot_file, folder, board, pull_downs):
+    def __init__(self, robot_file, folder, board, pull_downs, errors):
         self.folder, self.runs = folder, folder / "runtime-log-1"
+        self.errors = errors
 
     def __enter__(self):
         (self.folder / "board.jsonl").write_text("new")
@@ -19,6 +20,9 @@ class Interrupted:
 
     def __exit__(self, *error):
         pass
+
+    def calibrate(self):
+        (self.folder / "calibration.toml").write_text(str(tuple(self.errors)))
 
     def run(self, *options):
         (self.runs / "1-down").mkdir(parents=True)
@@ -37,10 +41,10 @@ def run_command(tmp_path, model_file, monkeypatch):
     """run_command() runs the command with --report tmp_path / "out"; its rig is interrupted."""
     monkeypatch.setattr(rig, "Rig", Interrupted)
 
-    def run():
+    def run(*more):
         arguments = {"--robot": "pneumatic-3", "--model": model_file, "--task": "down", "--report": tmp_path / "out"}
         options = [str(part) for pair in [*arguments.items(), ("--board", "native")] for part in pair]
-        return cli.cli.main(options, standalone_mode=False)
+        return cli.cli.main([*options, *more], standalone_mode=False)
 
     return run
 
@@ -86,6 +90,20 @@ def test_next_run_replaces_the_traces_of_an_interrupted_one(tmp_path, run_comman
     with pytest.raises((KeyboardInterrupt, click.Abort)):
         run_command()
     assert texts(tmp_path / "out") == {**own, "mine.txt": "mine", "runs/1-down/run.jsonl": "mine"}
+
+
+@pytest.mark.parametrize(
+    ("options", "calibrated"),
+    [
+        (["--mounting-error", "10", "5", "--noise-deg", "0.5"], "(10.0, 5.0, 0.5, 0.0, 0)"),
+        (["--mounting-error", "0", "5", "--noise-mm", "0.1", "--seed", "3"], "(0.0, 5.0, 0.0, 0.1, 3)"),
+        (["--noise-deg", "0.5"], None),
+    ],
+)
+def test_mounting_errors_are_calibrated_before_the_run(options, calibrated, tmp_path, run_command):
+    with pytest.raises((KeyboardInterrupt, click.Abort)):
+        run_command(*options)
+    assert texts(tmp_path / "out").get("calibration.toml") == calibrated
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path, run_command):

@@ -302,3 +302,12 @@ def test_real_board_that_reports_another_pressure_fails(real_board):
     assert "applied pressures, as reported: largest difference from the settled set-point 0.5" in assessment.reason
     assert "applied pressures, as reported: all 0, after the vent began inf ms" in assessment.reason
     assert "valve outputs" not in assessment.reason
+
+
+def test_limits_of_measured_angles_include_the_noise_of_the_tracker(reference):
+    limits = {line.name: line.limit for line in criteria.robot_criteria(reference)}
+    noisy = {line.name: line.limit for line in criteria.robot_criteria(replace(reference, noise_deg=0.5))}
+    assert limits["measured configuration: angle to the simulated robot's"] == "at most 1°"
+    assert noisy["measured configuration: angle to the simulated robot's"] == "at most 5.24264°"
+    assert limits["tracking error of module 1, mean"] == "at most 0.5°"
+    assert noisy["tracking error of module 1, mean"] == "at most 1.20711°"

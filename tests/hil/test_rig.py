@@ -17,9 +17,10 @@ from processes import descendants
 
 from modsoft.hil import criteria, record
 from modsoft.hil.board import emulator
+from modsoft.hil.child import Child
 from modsoft.hil.outputs import emulated_us, read_outputs
 from modsoft.hil.polaris import write_tool_files
-from modsoft.hil.rig import Child, Rig
+from modsoft.hil.rig import Rig
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import angle_between_deg
 from modsoft.runtime.control.tasks import load_task

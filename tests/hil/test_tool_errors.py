@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from tools_at_rest import bent_poses, straight
 
+from modsoft.hil.child import Child
 from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.polaris_device import Polaris
-from modsoft.hil.rig import Child
 from modsoft.hil.tool_errors import ToolErrors
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.calibration import file, rotations

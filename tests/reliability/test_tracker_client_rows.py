@@ -12,8 +12,8 @@ import pytest
 import tracker_clients
 from virtual_loop import ROBOT, planar_poses
 
+from modsoft.hil.child import Child
 from modsoft.hil.polaris import write_tool_files
-from modsoft.hil.rig import Child
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.errors import DeviceAbsent
 from modsoft.runtime.safety import FrameValidator

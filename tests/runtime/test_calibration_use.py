@@ -1,6 +1,7 @@
 """The calibration that a run uses: chosen, checked, applied to every frame, reported and stored with the log."""
 
 import dataclasses
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -66,6 +67,7 @@ def test_file_of_the_option_has_precedence_and_must_exist(folder):
         used(folder, option=other)
     other.write_bytes((folder / "robot.calibration.toml").read_bytes())
     assert used(folder, option=other).path == other
+    assert used(folder, option=Path("none")) is None
 
 
 def test_calibration_of_another_robot_or_of_other_tools_is_refused(folder):

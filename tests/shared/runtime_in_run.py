@@ -14,8 +14,8 @@ from pathlib import Path
 from virtual_loop import planar_poses
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.hil.child import Child
 from modsoft.hil.polaris import write_tool_files
-from modsoft.hil.rig import Child
 from modsoft.runtime.log_reader import Follower, read
 
 SCRIPT = Path(sys.executable).with_name("modsoft-runtime")

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from modsoft.hil.board.emulator import EmulatedBoard
+from modsoft.hil.child import Child
 from modsoft.hil.plant import tool_poses
 from modsoft.hil.polaris import write_tool_files
-from modsoft.hil.rig import Child
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.board.codec import encode

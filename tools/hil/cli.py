@@ -7,10 +7,11 @@ import shutil
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from modsoft.hil.tool_errors import ToolErrors
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import load_task
 from modsoft.runtime.entry_point import entry
@@ -52,8 +53,30 @@ SETTLE_S = 1.5  # the traces continue for so long after the runtime, until the c
     help="With or without resistors of 10 kOhm from the valve pins to ground, see docs/hardware.md.",
 )
 @click.option("--steps", type=click.IntRange(1), help="Run only so many control steps.  [default: the whole task]")
+@click.option(
+    "--mounting-error",
+    default=(0.0, 0.0),
+    type=(click.FloatRange(0.0, 15.0), click.FloatRange(0.0, 10.0)),
+    metavar="DEG MM",
+    help="Mount the tool of each module with a random error of at most this; modsoft-calibrate rest runs first.",
+)
+@click.option(
+    "--noise-deg", default=0.0, type=click.FloatRange(0.0, 5.0), help="Noise of the tracker, for each axis of a tool."
+)
+@click.option(
+    "--noise-mm", default=0.0, type=click.FloatRange(0.0, 5.0), help="The same, for each axis of its position."
+)
+@click.option("--seed", default=0, help="Of mounting errors and noise.")
 def cli(
-    robot_file: str, model: Path, task: str, report: Path, board: str, yes: bool, pull_downs: bool, steps: int | None
+    robot_file: str,
+    model: Path,
+    task: str,
+    report: Path,
+    board: str,
+    yes: bool,
+    pull_downs: bool,
+    steps: int | None,
+    **tracker: Any,
 ) -> int:
     """Run a controller in real time on emulated hardware and check the run against its criteria.
 
@@ -75,9 +98,9 @@ def cli(
     another version or for other hardware, ...).
 
     The folder gets report.md, report.json, angles.png, run.jsonl (the runtime's log), board.jsonl (timer registers of
-    the emulated board, or messages of the real one) and plant.jsonl (the simulated robot). Run nothing else on the
-    machine meanwhile. An interrupted run leaves its traces there and no report; the next run into this folder replaces
-    them.
+    the emulated board, or messages of the real one), plant.jsonl (the simulated robot), and with --mounting-error
+    calibration.toml and its picture. Run nothing else on the machine meanwhile. An interrupted run leaves its traces
+    there and no report; the next run into this folder replaces them.
     """
     _check_system()
     from tqdm import tqdm
@@ -101,16 +124,19 @@ def cli(
 
     options = [] if steps is None else ["--steps", str(steps)]
     with report_folder.claimed(report):
-        rig = Rig(robot_file, report, rig_board, pull_downs=pull_downs)
+        rig = Rig(robot_file, report, rig_board, pull_downs=pull_downs, errors=_tool_errors(**tracker))
         try:
             with rig:
+                if rig.errors.mounting_deg or rig.errors.mounting_mm:
+                    rig.calibrate()
                 rig.run(model, task, *options)
                 with tqdm(total=count, unit=" ticks", desc="run", disable=not sys.stderr.isatty()) as bar:
                     rig.wait(count * robot.loop.period_s + RUN_MARGIN_S, lambda ticks: bar.update(ticks - bar.n))
                 rig.settle(SETTLE_S)
         finally:
             has_log = _move_log(rig, report)
-    run = record.read(report, report if has_log else None, robot, task, desired, rig.runtime.returncode)
+    log = report if has_log else None
+    run = record.read(report, log, robot, task, desired, rig.runtime.returncode, rig.errors.noise_deg)
     assessment = criteria.assess(run)
     about = _about(rig, robot_file, model, task, steps, count)
     if no_picture := reports.write(run, assessment, about, report):
@@ -123,6 +149,10 @@ def cli(
     click.echo(f"{assessment}\n{report / 'report.md'}")
     # a run without a tick has no figures: its exit code is the runtime's
     return run.runtime_exit if run.runtime_exit and not len(run.tick) else assessment.exit_code
+
+
+def _tool_errors(mounting_error: tuple[float, float], noise_deg: float, noise_mm: float, seed: int) -> ToolErrors:
+    return ToolErrors(*mounting_error, noise_deg, noise_mm, seed)
 
 
 def _prepared_board(board: str, robot: Robot, yes: bool) -> str | SerialBoard:
@@ -148,7 +178,8 @@ def _about(rig: Rig, robot_file: str, model: Path, task: str, steps: int | None,
     from modsoft.hil import record
     from modsoft.hil.board.serial_board import SerialBoard
 
-    robot, board = rig.robot, rig.board
+    robot, board, errors = rig.robot, rig.board, rig.errors
+    has_noise = errors.noise_deg or errors.noise_mm
     if isinstance(board, SerialBoard):
         hello, firmware = board.hello, "not seen"
         description = (
@@ -161,13 +192,18 @@ def _about(rig: Rig, robot_file: str, model: Path, task: str, steps: int | None,
         "command": f"modsoft-hil --robot {Path(robot_file).name} --model {model.name} --task {Path(task).name} "
         f"--board {board.board}"
         + (" --no-pull-downs" if not rig.pull_downs else "")
-        + (f" --steps {steps}" if steps else ""),
+        + (f" --steps {steps}" if steps else "")
+        + (f" --mounting-error {errors.mounting_deg:g} {errors.mounting_mm:g}" if rig.calibration else "")
+        + (f" --noise-deg {errors.noise_deg:g} --noise-mm {errors.noise_mm:g}" if has_noise else "")
+        + (f" --seed {errors.seed}" if errors.seed else ""),
         "board": description,
         "board's clock": board.clock,
         "firmware, SHA-256": firmware,
         "model, SHA-256": hashlib.sha256(model.read_bytes()).hexdigest(),
         "robot": f"{robot.name}, {robot.modules} modules, {robot.loop.hz:g} Hz",
         "task": f"{task}, {count} control steps",
+        "tracker": f"mounting errors of at most {errors.mounting_deg:g}° and {errors.mounting_mm:g} mm, "
+        f"{'' if rig.calibration else 'not '}calibrated; noise of {errors.noise_deg:g}° and {errors.noise_mm:g} mm",
     }
 
 

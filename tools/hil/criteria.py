@@ -37,6 +37,9 @@ DROPPED_BYTES = 0
 CHAMBERS_AT_END_BAR = 0.02
 DESIRED_ERROR = 1e-9  # of a component: the log rounds to nine digits
 MEASUREMENT_ERROR_DEG = 1.0  # the tracker rounds, and its frame is up to 40 ms old while the robot moves
+# A configuration is that of two tools, so its noise has a standard deviation of sqrt(2) times that of a tool.
+LARGEST_BY_NOISE = 6.0 * math.sqrt(2.0)  # in a run, of the standard deviation of a tool
+MEAN_BY_NOISE = math.sqrt(2.0)
 # Mean tracking error of each module, degrees, by task and number of modules: about twice what four minutes of training
 # on three modules were measured to reach: down 0.05 1.03 1.88 and 0.95 1.81, edge 0.10 0.58 3.11 and 0.74 2.51.
 TRACKING_DEG: dict[tuple[str, int], list[float]] = {
@@ -237,11 +240,13 @@ def robot_criteria(record: Record) -> list[Criterion]:
     name = "measured configuration: angle to the simulated robot's"
     if not len(record.tick) or len(record.plant_mono_ns) < 2:
         return [*lines, Criterion(name, "no ticks", f"at most {MEASUREMENT_ERROR_DEG:g}°", False)]
-    lines.append(at_most(name, _largest(measurement_error_deg(record)), MEASUREMENT_ERROR_DEG, "°"))
+    largest_deg = MEASUREMENT_ERROR_DEG + LARGEST_BY_NOISE * record.noise_deg
+    lines.append(at_most(name, _largest(measurement_error_deg(record)), largest_deg, "°"))
     mean_deg = np.nanmean(tracking_error_deg(record), axis=0)
     for module, limit in enumerate(TRACKING_DEG.get((record.task, record.robot.modules), [])):
         name = f"tracking error of module {module + 1}, mean"
-        lines.append(at_most(name, float(mean_deg[module]), limit, "°", timing=True))
+        limit_deg = limit + MEAN_BY_NOISE * record.noise_deg
+        lines.append(at_most(name, float(mean_deg[module]), limit_deg, "°", timing=True))
     return lines
 
 

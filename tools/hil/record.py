@@ -65,6 +65,7 @@ class Record:
     plant_late_ms: Array  # of the slices in the run
     # A real board shows no registers: `outputs` are the applied pressures of its STATUS, of at most this age.
     sees_registers: bool = True
+    noise_deg: float = 0.0  # of the fake tracker, standard deviation of each axis of a tool
     outputs_age_ms: float = 0.0
 
     @property
@@ -73,11 +74,19 @@ class Record:
         return len(self.reference)
 
 
-def read(folder: Path, run: Path | None, robot: Robot, task: str, reference: Array, runtime_exit: int) -> Record:
+def read(
+    folder: Path,
+    run: Path | None,
+    robot: Robot,
+    task: str,
+    reference: Array,
+    runtime_exit: int,
+    noise_deg: float = 0.0,
+) -> Record:
     """Reads the record of a run.
 
     folder: of the rig's traces. run: of the runtime's log; None: the runtime made none. reference (steps, N, 3): the
-    desired configurations of the task.
+    desired configurations of the task. noise_deg: of the fake tracker.
     """
     events = lines(folder / "board.jsonl")
     plant = lines(folder / "plant.jsonl")
@@ -95,6 +104,7 @@ def read(folder: Path, run: Path | None, robot: Robot, task: str, reference: Arr
         task=task,
         reference=reference,
         runtime_exit=runtime_exit,
+        noise_deg=noise_deg,
         runtime_message=messages[-1] if messages else "",
         tick=np.array([tick.tick for tick in ticks], dtype=np.int64),
         mono_ns=np.array([tick.mono_ns for tick in ticks], dtype=np.int64),

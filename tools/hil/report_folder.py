@@ -16,7 +16,10 @@ FINISHED = "report.json"  # written last: where it exists, the other files are c
 MARKER = ".modsoft-hil"
 MARKER_TEXT = "modsoft-hil wrote the report in this folder and may replace it.\n"
 RUN_FILES = ("run.jsonl", "meta.json")  # the runtime's log
-WRITTEN = (*RUN_FILES, "board.jsonl", "plant.jsonl", "runtime.out", "runtime.err", "report.md", FINISHED, "angles.png")
+CALIBRATION = "calibration.toml"  # of the fake tracker's tools
+CALIBRATION_FILES = (CALIBRATION, "calibration.png", "calibration.out")
+TRACES = (*RUN_FILES, *CALIBRATION_FILES, "board.jsonl", "plant.jsonl", "runtime.out", "runtime.err")
+WRITTEN = (*TRACES, "report.md", FINISHED, "angles.png")
 LOG_PREFIX = "runtime-log-"  # of the folder that the runtime logs to while it runs
 
 

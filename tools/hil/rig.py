@@ -18,92 +18,25 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, cast
+from typing import IO
 
-from modsoft.hil.board.emulator import EmulatedBoard, end
+from modsoft.hil.board.emulator import EmulatedBoard
 from modsoft.hil.board.serial_board import SerialBoard
+from modsoft.hil.child import Child, Line
 from modsoft.hil.plant import load_robot
 from modsoft.hil.polaris import write_tool_files
-from modsoft.hil.report_folder import LOG_PREFIX
+from modsoft.hil.report_folder import CALIBRATION, LOG_PREFIX
+from modsoft.hil.tool_errors import NO_ERRORS, ToolErrors
+from modsoft.runtime.calibration.use import NONE
 from modsoft.runtime.errors import DeviceAbsent, LostInRun, UsageError
 from modsoft.runtime.log_reader import Follower
 
-Line = dict[str, Any]
-
-START_TIMEOUT_S = 60.0  # the first start compiles the simulator
 RUNTIME_STOP_TIMEOUT_S = 5.0  # it vents and waits for the board's confirmation
 FORWARD_PERIOD_S = 0.004  # a slewing board changes its duties every millisecond; the plant needs them every 20
 SENSED_CHANNELS = 16  # A0 to A15
-
-
-class Child:
-    """A helper process that takes JSON lines and gives JSON lines. `on_line` runs in its reading thread."""
-
-    def __init__(self, module: str, arguments: Sequence[str], on_line: Callable[[Line], None]):
-        self.name = module.rpartition(".")[2]
-        self._on_line = on_line
-        self._sending = threading.Lock()
-        self._ready = threading.Event()
-        self._ended = False
-        self._stderr = tempfile.TemporaryFile()
-        self.ready: Line = {}
-        self.summary: Line = {}
-        self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._stderr,
-            start_new_session=True,  # a Ctrl-C at the terminal is for the rig, which ends its children in order
-        )
-        # Popen's own are optional, for processes without pipes.
-        self._input, self._output = cast(IO[bytes], self.process.stdin), cast(IO[bytes], self.process.stdout)
-        self._reader = threading.Thread(target=self._read, name=self.name, daemon=True)
-        self._reader.start()
-
-    def wait_ready(self, timeout_s: float = START_TIMEOUT_S) -> None:
-        """Returns when the process reports `ready`; `DeviceAbsent` with its last message when it ended."""
-        deadline = time.monotonic() + timeout_s
-        while not self._ready.wait(0.1):
-            if self.process.poll() is not None or time.monotonic() > deadline:
-                raise DeviceAbsent(f"the {self.name} did not start: {self.last_message()}")
-
-    def send(self, line: Line) -> None:
-        """Sends one line to the process; `check` finds out whether it has ended."""
-        with contextlib.suppress(BrokenPipeError, ValueError), self._sending:
-            self._input.write(json.dumps(line).encode() + b"\n")
-            self._input.flush()
-
-    def check(self) -> None:
-        """`LostInRun` if the process ended by itself."""
-        if self._ended and self.process.poll() is not None:
-            raise LostInRun(f"the {self.name} ended in mid-run: {self.last_message()}")
-
-    def last_message(self) -> str:
-        self._stderr.seek(0)
-        lines = self._stderr.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else f"exit code {self.process.poll()}"
-
-    def stop(self) -> None:
-        """Ends the process by the end of its input, or by force. May be called twice."""
-        end(self.process, self._sending)
-        self._reader.join()
-        self._output.close()
-        self._stderr.close()
-
-    def _read(self) -> None:
-        for text in self._output:
-            line = json.loads(text)
-            if line["event"] == "ready":
-                self.ready = line
-                self._ready.set()
-            elif line["event"] == "summary":
-                self.summary = line
-            else:
-                self._on_line(line)
-        self._ended = True
 
 
 class Rig:
@@ -111,14 +44,20 @@ class Rig:
     time; `run` starts modsoft-runtime on them."""
 
     def __init__(
-        self, robot_file: str | Path, folder: Path, board: str | SerialBoard = "auto", pull_downs: bool = True
+        self,
+        robot_file: str | Path,
+        folder: Path,
+        board: str | SerialBoard = "auto",
+        pull_downs: bool = True,
+        errors: ToolErrors = NO_ERRORS,
     ):
         """`robot_file`: file or shipped name; `folder`: of the traces and the runtime's output; `board`: an emulated
-        board's name, or a real board after its `check`."""
+        board's name, or a real board after its `check`; `errors`: of the tracker's tools."""
         self.robot = load_robot(robot_file)
         self._robot_file = str(Path(robot_file).resolve() if Path(robot_file).is_file() else robot_file)
         self.folder = folder
-        self.pull_downs = pull_downs
+        self.pull_downs, self.errors = pull_downs, errors
+        self.calibration: Path | None = None
         self.runs: Path | None = None  # where the latest runtime logs
         self._follower: Follower | None = None  # of that log
         self.board: EmulatedBoard | SerialBoard
@@ -145,7 +84,7 @@ class Rig:
             self._plant_log = exits.enter_context((self.folder / "plant.jsonl").open("w", encoding="utf-8"))
             self.tool_files = write_tool_files(self._ports, self.robot.modules + 1)
             kind = self.robot.tracker.type
-            fake = ["--link", str(self._ports / "ttyPolaris"), "--type", kind]
+            fake = ["--link", str(self._ports / "ttyPolaris"), "--type", kind, "--errors", *map(str, self.errors)]
             if kind == "aurora":  # its tools are wired
                 fake += ["--wired", str(len(self.tool_files))]
                 self.tool_files = []
@@ -176,37 +115,43 @@ class Rig:
     def tracker_port(self) -> str:
         return str(self.tracker.ready["port"])
 
+    def calibrate(self) -> None:
+        """Runs the unmodified `modsoft-calibrate rest`, which writes calibration.toml and its picture; `run` uses them.
+        `LostInRun` with its last line where it fails."""
+        self.calibration = self.folder / CALIBRATION
+        command = [self._script("modsoft-calibrate"), "rest", "--yes", *self._of_tracker]
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, encoding="utf-8", check=False
+        )
+        (self.folder / "calibration.out").write_text(done.stdout, encoding="utf-8")
+        if done.returncode:
+            raise LostInRun(f"the calibration on the rig failed: {done.stderr.strip().splitlines()[-1:]}")
+
+    @property
+    def _of_tracker(self) -> list[str]:
+        """Options of robot, tracker, tools and calibration."""
+        tools = [option for path in self.tool_files for option in ("--tool", str(path))]
+        calibration = str(self.calibration or NONE)  # a file beside the robot file is that of the real robot
+        return ["--robot", self._robot_file, "--tracker-port", self.tracker_port, *tools, "--calibration", calibration]
+
+    @staticmethod
+    def _script(name: str) -> str:
+        """A console script beside this interpreter."""
+        script = Path(sys.executable).parent / name
+        if not script.is_file():
+            raise UsageError(f"no {name} beside {Path(sys.executable).name}: pip install modsoft there first")
+        return str(script)
+
     def run(self, model: str | Path, task: str, *options: str, runs: Path | None = None) -> subprocess.Popen[bytes]:
         """Starts the unmodified modsoft-runtime by its console script beside this interpreter.
 
         Its log goes to a folder in `runs` (None: a new folder in the rig's own), its output to runtime.out and
         runtime.err. options: further options of modsoft-runtime.
         """
-        script = Path(sys.executable).parent / "modsoft-runtime"
-        if not script.is_file():
-            raise UsageError(f"no {script.name} beside {Path(sys.executable).name}: pip install modsoft there first")
+        script = self._script("modsoft-runtime")
         self.runs = runs or Path(tempfile.mkdtemp(prefix=LOG_PREFIX, dir=self.folder))
-        tools = [option for path in self.tool_files for option in ("--tool", str(path))]
-        command = [
-            str(script),
-            "--yes",
-            "--robot",
-            self._robot_file,
-            "--model",
-            str(model),
-            "--task",
-            task,
-            "--port",
-            self.board.port,
-            "--tracker",
-            "ndi",
-            "--tracker-port",
-            self.tracker_port,
-            *tools,
-            "--runs-dir",
-            str(self.runs),
-            *options,
-        ]
+        command = [script, "--yes", *self._of_tracker, "--tracker", "ndi", "--port", self.board.port]
+        command += ["--model", str(model), "--task", task, "--runs-dir", str(self.runs), *options]
         with (self.folder / "runtime.out").open("wb") as out, (self.folder / "runtime.err").open("wb") as errors:
             self.runtime = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=errors, start_new_session=True
