@@ -32,6 +32,7 @@ NOISE_FACTOR = 4.5  # and this many standard deviations of the mean
 FAR_DEG = 40.0  # from the direction of every chamber; a third of the distance between two where that is less
 OTHER_MODULE = 0.5  # share of the largest bend: another module that bends as much is moved by the same hose
 STAYS_OPEN = 0.5  # share of bend or pressure that is left after a pulse
+EMPTYING_ROWS = VENT_ROWS  # so long a chamber may have the pressure of before
 TOO_HIGH, TOO_HIGH_BAR = 1.5, 0.03  # pressure above this factor and margin of the set-point
 
 
@@ -130,15 +131,10 @@ class Watch:
             check_closed(pulse_of(self._samples, self._channels, number))
 
     def _check_pressure(self, sample: Sample, rise_bar: Array) -> None:
-        row_bar = self._rows_bar[max(0, sample.row - 2) : sample.row + 1].max()  # a reading may be of the row before
+        row_bar = self._rows_bar[max(0, sample.row - EMPTYING_ROWS) : sample.row + 1].max()
         most = int(np.argmax(np.nan_to_num(rise_bar, nan=-np.inf)))
         if not rise_bar[most] > TOO_HIGH * row_bar + TOO_HIGH_BAR:  # NaN: no sensor
             return
-        if row_bar == 0.0:
-            raise Tripped(
-                f"the sensor at A{most} measures {rise_bar[most]:.2f} bar although every valve is set to 0: its valve "
-                "stays open; shut off the air and look at it"
-            )
         channel = channel_of_row(self._channels, sample.row)
         raise Tripped(
             f"the sensor at A{most} measures {rise_bar[most]:.2f} bar during the pulse of channel {channel}, expected "

@@ -16,7 +16,7 @@ import numpy as np
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.protocol import CHANNELS
 from modsoft.runtime.calibration.channel_faults import NO_PRESSURE, OFFSET_BAR, wrong_full_scale
-from modsoft.runtime.calibration.channels import REST_ROWS
+from modsoft.runtime.calibration.channels import EMPTYING_ROWS, REST_ROWS
 from modsoft.runtime.calibration.schedule import Sample, mean_of
 from modsoft.runtime.errors import Tripped
 from modsoft.runtime.layout import listed
@@ -84,7 +84,7 @@ class Watch:
 
     def __call__(self, sample: Sample) -> None:
         """Raises `Tripped`."""
-        set_bar = self._rows_bar[max(0, sample.row - 2) : sample.row + 1].max()  # a reading may be of the row before
+        set_bar = self._rows_bar[max(0, sample.row - EMPTYING_ROWS) : sample.row + 1].max()
         measured_bar = np.nan_to_num(sample.measured_bar, nan=-np.inf)
         most = int(np.argmax(measured_bar))
         if sample.row >= REST_ROWS and measured_bar[most] > TOO_HIGH * set_bar + TOO_HIGH_BAR:
