@@ -159,6 +159,20 @@ ROWS: dict[int, Row] = {
         "pull-downs vent; the host names the cause",
         "down in 250 ms with pull-downs; back after power off",
     ),
+    56: Row(
+        "hoses in any order (modsoft-calibrate channels)",
+        "channel of every chamber recognised",
+        "100 of 100, each in 60 s, never above the safe pressure",
+    ),
+    57: Row("valve dead, leaking or open, hose blocked, no air", "named", "all; nothing written, leaks excepted"),
+    58: Row("two hoses in one chamber, one in two, hose at another valve", "named", "all; nothing written"),
+    59: Row(
+        "sensor missing, at another input, with an offset; wrong full scale",
+        "named",
+        "all; never above the safe pressure",
+    ),
+    60: Row("tools swapped, hidden during a pulse", "named; no valve opens unobserved", "all; vented"),
+    61: Row("end of a calibration: signal, key, error, lost device", "vent as row 12", "all 0 at any phase"),
 }
 
 CLOCKS = {"emulated": "board's cycles", "virtual": "injected", "host": "wall", "none": ""}

@@ -42,30 +42,31 @@ def run_tool(folder, *lines):
     return done.returncode, done.stdout + done.stderr, page.read_text() if page.exists() else ""
 
 
-ALL = range(1, 50)
+ALL = [*range(1, 50), *range(56, 62)]
+COUNT = len(ALL)
 
 
 def test_every_row_of_the_matrix_has_its_test():
     names = re.findall(r"^def test_row_(\d\d)_\w+\(", "".join(p.read_text() for p in HERE.glob("test_*.py")), re.M)
-    assert sorted(set(map(int, names))) == list(ALL)
+    assert sorted(set(map(int, names))) == ALL
 
 
 def test_complete_matrix_has_every_row_met(tmp_path):
     code, output, page = run_tool(tmp_path, *map(line, ALL))
-    assert (code, "49 of 49 rows are met." in output) == (0, True)
-    assert page.count("| 484 ms | board's cycles | yes |") == 49
+    assert (code, f"{COUNT} of {COUNT} rows are met." in output) == (0, True)
+    assert page.count("| 484 ms | board's cycles | yes |") == COUNT
 
 
 def test_row_without_a_line_is_missing(tmp_path):
     code, output, page = run_tool(tmp_path, *(line(row) for row in ALL if row not in (7, 30)))
-    assert (code, "47 of 49 rows are met. Missing: 7, 30." in output) == (1, True)
+    assert (code, f"{COUNT - 2} of {COUNT} rows are met. Missing: 7, 30." in output) == (1, True)
     assert page.count("**missing**") == 2
 
 
 def test_row_with_an_unmet_line_is_unmet(tmp_path):
     lines = [*map(line, ALL), line(30, fault="emulated", worst="2.2 ms", met=False, why="one long pass")]
     code, output, page = run_tool(tmp_path, *lines)
-    assert (code, "48 of 49 rows are met. Not met: 30." in output) == (1, True)
+    assert (code, f"{COUNT - 1} of {COUNT} rows are met. Not met: 30." in output) == (1, True)
     assert "| 2.2 ms | board's cycles | **no**: one long pass |" in page
 
 

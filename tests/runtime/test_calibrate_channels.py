@@ -59,44 +59,7 @@ def test_no_set_point_is_above_the_pressure_and_one_valve_opens_at_a_time(pressu
     assert pulse_s < 2.0, "the firmware would vent for a sensor that is missing"
 
 
-# ---- Faults: each is named by the channel, the module or the input
-
-
-def stick_open(rig):
-    """The valve of channel 2 opens and stays open."""
-    at = channels.REST_ROWS + 2 * channels.PULSE_ROWS + channels.HOLD_ROWS
-    rig.on_row = lambda row: rig.pneumatics.stuck_bar.update({2: SAFE_BAR}) if row == at else None
-
-
-MAPPING_FAULTS = {
-    "dead valve": (lambda rig: rig.pneumatics.dead.add(2), "channel 2: no module moves"),
-    "blocked hose": (lambda rig: rig.pneumatics.blocked.add(2), "channel 2: "),
-    "large leak": (lambda rig: rig.pneumatics.leaks.update({0: 0.7}), "channel 0: no module moves"),
-    "valve open from the start": (lambda rig: rig.pneumatics.stuck_bar.update({2: 0.01}), "channel 2: no module moves"),
-    "two hoses in one chamber": (
-        lambda rig: rig.pneumatics.hoses.update({2: ((2, 0),)}),
-        "channels 2, 4 bend module 3 as its chamber at 180 degrees does",
-    ),
-    "one hose in two chambers": (
-        lambda rig: rig.pneumatics.hoses.update({2: ((1, 0), (2, 0))}),
-        "channel 2 bends module 3 by",
-    ),
-    "no supply": (lambda rig: setattr(rig.pneumatics, "has_supply", False), "no channel bends a module"),
-    "base's tool swapped": (lambda rig: setattr(rig, "swapped", (0, 1)), "the base's tool turns by"),
-    "modules' tools swapped": (lambda rig: setattr(rig, "swapped", (2, 3)), "channel 4 bends module 3 by"),
-}
-
-
-@pytest.mark.parametrize("sensors", [range(6), ()], ids=["sensors", "none"])
-@pytest.mark.parametrize("name", MAPPING_FAULTS)
-def test_fault_of_valve_hose_or_tool_is_named_and_nothing_is_written(name, sensors):
-    plant, line = MAPPING_FAULTS[name]
-    rig = DirectRig(noise_deg=0.5, mounting_deg=10.0, seed=3, sensors=sensors)
-    plant(rig)
-    result = rig.channels()
-    assert result.chambers is None
-    assert any(fault.startswith(line) for fault in result.faults), result.faults
-    assert len(result.faults) <= 3, result.faults
+# ---- Faults; more of them in rows 57 to 60 of the failure matrix
 
 
 def test_sensor_tells_a_dead_valve_from_a_blocked_hose_and_a_leak():
@@ -110,56 +73,13 @@ def test_sensor_tells_a_dead_valve_from_a_blocked_hose_and_a_leak():
     assert "0.06 of 0.19 bar: a leak" in first_fault(lambda p: p.leaks.update({0: 0.7}))
 
 
-@pytest.mark.parametrize("sensors", [range(6), ()], ids=["sensors", "none"])
-def test_valve_that_stays_open_ends_the_run(sensors):
-    rig = DirectRig(noise_deg=0.5, sensors=sensors)
-    stick_open(rig)
-    with pytest.raises(Tripped, match=r"(channel 2:|sensor at A2) .* stays open; shut off the air"):
-        rig.channels()
-    assert rig.largest_bar <= SAFE_BAR + 1e-9
-    assert rig.time_s < PERIOD_S * (channels.REST_ROWS + 3 * channels.PULSE_ROWS + 2), "no other valve may open"
-
-
-SENSOR_FAULTS = {
-    "missing sensor": (lambda p: p.unconnected.add(2), "input A2 measures no pressure: connect the sensor"),
-    "sensor at another input": (
-        lambda p: p.inputs.update({2: 4, 4: 2}),
-        "the pressure of channel 2 shows at the input A4, expected A2",
-    ),
-    "sensor's offset": (lambda p: p.sensor_offset_bar.update({2: 0.03}), "sensor of channel 2 measures +0.030 bar"),
-    "leak": (lambda p: p.leaks.update({2: 0.4}), "the sensor of channel 2 measures 0.11 of 0.19 bar: a leak"),
-}
-
-
-@pytest.mark.parametrize("name", SENSOR_FAULTS)
-def test_fault_of_a_sensor_is_named_and_the_chambers_are_known(name):
-    change, line = SENSOR_FAULTS[name]
-    rig = DirectRig(noise_deg=0.5)
-    change(rig.pneumatics)
-    result = rig.channels()
-    assert channels_of(result) == expected(PLANAR, range(6))
-    assert any(line in each for each in result.lines), result.lines
-
-
-def test_leak_without_sensors_shows_in_the_bend():
-    rig = DirectRig(noise_deg=0.5, sensors=())
-    rig.pneumatics.leaks[2] = 0.5
-    assert any("channel 2 bends module 2 at 180 degrees by" in line for line in rig.channels().lines)
-
-
-def test_smaller_full_scale_of_the_valves_is_named():
+def test_no_other_valve_opens_after_one_that_stays_open():
     rig = DirectRig()
-    rig.pneumatics.full_scale_bar = 1.0
-    [fault] = rig.channels().faults
-    assert fault.startswith("every sensor measures 0.33 times the pressure of its valve: compare full_scale_bar")
-
-
-def test_larger_full_scale_of_the_valves_ends_the_run_below_the_safe_pressure():
-    rig = DirectRig()
-    rig.pneumatics.full_scale_bar = 10.0
-    with pytest.raises(Tripped, match=r"the sensor at A0 measures 0.1\d bar during the pulse of channel 0"):
+    at = channels.REST_ROWS + 2 * channels.PULSE_ROWS + channels.HOLD_ROWS
+    rig.on_row = lambda row: rig.pneumatics.stuck_bar.update({2: SAFE_BAR}) if row == at else None
+    with pytest.raises(Tripped, match=r"channel 2: .* its valve stays open; shut off the air"):
         rig.channels()
-    assert rig.largest_bar <= SAFE_BAR
+    assert rig.time_s < PERIOD_S * (channels.REST_ROWS + 3 * channels.PULSE_ROWS + 2)
 
 
 def test_exchanged_hoses_are_named():

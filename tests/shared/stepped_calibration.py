@@ -6,7 +6,9 @@ import contextlib
 
 from calibrated_rig import PLANAR, arm_of
 
+from modsoft.hil.polaris_device import Polaris
 from modsoft.hil.stepped import SteppedRig
+from modsoft.hil.tool_errors import NO_ERRORS
 from modsoft.runtime import shutdown
 from modsoft.runtime.calibration import channels, procedure
 from modsoft.runtime.devices import Devices
@@ -25,8 +27,9 @@ class SteppedCalibration(SteppedRig):
     """Context manager. `at(seconds, cause)`: calls `cause()` when so much time has passed since the rig began.
     `largest_bar`: in any chamber. `messages`: (highest duty at that time, line) of everything reported."""
 
-    def __init__(self, robot=PLANAR, board="native"):
-        super().__init__(robot, arm_of(robot), board)
+    def __init__(self, robot=PLANAR, board="native", errors=NO_ERRORS, arm=None):
+        """errors: of the tools; arm: a simulated robot, by default one in closed form."""
+        super().__init__(robot, arm or arm_of(robot), board, lambda now: Polaris(now, errors=errors))
         self.causes, self.messages, self.largest_bar = [], [], 0.0
 
     def __enter__(self):
