@@ -11,6 +11,7 @@ from modsoft.runtime import robot as robot_file
 from modsoft.runtime.choices import CORRECTIONS
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import RobotFileError, UsageError
+from modsoft.runtime.modules import AUTO
 from modsoft.runtime.terminal import has_terminal
 
 
@@ -84,6 +85,12 @@ def _without_run(list_ports: bool, check: str | None, print_robot: str | None) -
     return any(options)
 
 
+def _modules(context: click.Context, parameter: click.Parameter, value: str) -> str:
+    if value not in ("", AUTO) and not (value.isdecimal() and 2 <= int(value) <= 64):
+        raise click.BadParameter(f"found {value!r}, expected a number from 2 to 64, or auto")
+    return value
+
+
 @click.command("modsoft-runtime", context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
 @click.option(
     "--port",
@@ -139,6 +146,14 @@ def _without_run(list_ports: bool, check: str | None, print_robot: str | None) -
     type=click.Path(path_type=Path),
     help="Tool definition file, once for each tool: base, then module 1 to N. [default: tools under "
     "[tracker] in the robot file]",
+)
+@click.option(
+    "--modules",
+    default="",
+    metavar="N|auto",
+    callback=_modules,
+    help="Number of modules: the first N of the robot file; auto: as many as have a tool and chambers. [default: "
+    "modules under [robot] in the robot file]",
 )
 @click.option(
     "--calibration",

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import click
 
+from modsoft.runtime import modules
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.board import Board
@@ -46,7 +47,7 @@ FIRST_FRAME_WAIT_S = 5.0
 @dataclass(frozen=True)
 class DeviceOptions:
     """Options of every command that moves the robot; empty where the robot file decides. `calibration`: None for the
-    file beside the robot file."""
+    file beside the robot file. `modules`: their number, or "auto"."""
 
     robot: str
     port: str
@@ -56,6 +57,7 @@ class DeviceOptions:
     yes: bool
     dry_run: bool
     calibration: Path | None = field(default=None, kw_only=True)
+    modules: str = field(default="", kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -264,7 +266,7 @@ def read_robot(options: DeviceOptions) -> tuple[Robot, str, Path]:
             "no robot.toml in this folder; give --robot FILE, or make one to start from: "
             "modsoft-runtime --print-robot pneumatic-3 > robot.toml"
         )
-    robot = robot_file.load(options.robot)
+    robot = robot_file.load(options.robot, modules.of_option(options.modules, len(options.tools), options.robot))
     if robot.valve is None:
         raise RobotFileError(
             f"robot {robot.name} has no [valve], so it is only simulated (modsoft-simulate); this command drives "

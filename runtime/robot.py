@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections import Counter
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Annotated, Any, Literal, NoReturn
 import msgspec
 from msgspec import Meta
 
-from modsoft.runtime import layout
+from modsoft.runtime import layout, modules
 from modsoft.runtime.errors import RobotFileError
 from modsoft.runtime.files import read_text
 from modsoft.runtime.layout import MOTIONS, Actuators, Section, Simulation
@@ -58,12 +57,12 @@ class Sensors(Section, frozen=True):
 
 
 class Chamber(Section, frozen=True):
-    """`[[chambers]]`: valve channel of a chamber, and the correction of its pressure.
+    """`[[chambers]]`: valve channel of a chamber, and the correction of its pressure. Further modules may have theirs.
 
     direction_deg: the entry of `directions_deg` that it is at; pressure sent = gain * pressure + offset_bar.
     """
 
-    module: Annotated[int, Meta(ge=1)]
+    module: Annotated[int, Meta(ge=1, le=64)]
     direction_deg: float
     channel: Annotated[int, Meta(ge=0, le=11)]
     gain: Annotated[float, Meta(gt=0.0, le=2.0)] = 1.0
@@ -88,8 +87,8 @@ class Limits(Section, frozen=True):
 
 class Tracker(Section, frozen=True):
     """`[tracker]`: source and its port (replay: a run's folder); `tools` are the tool definition files, base first,
-    then module 1 to N. Paths are relative to the folder of the robot file. `frame_hz`: frame rate of the device; it is
-    learned from the frame numbers where it is not set."""
+    then module 1 to N, then those of further modules. Paths are relative to the folder of the robot file.
+    `frame_hz`: frame rate of the device; it is learned from the frame numbers where it is not set."""
 
     source: Literal["ndi", "replay"] = "ndi"
     type: Literal["polaris", "vega", "aurora"] = "polaris"
@@ -175,6 +174,9 @@ class Robot(Section, frozen=True):
         return msgspec.to_builtins(self)
 
 
+Count = Callable[[Robot], int]  # the number of modules of a robot file
+
+
 def names() -> list[str]:
     """Names of the shipped robots."""
     folder = resources.files("modsoft.runtime") / "robots"
@@ -192,14 +194,15 @@ def text_of(name: str) -> str:
     raise RobotFileError(f"no shipped robot {name!r}; expected one of {', '.join(names())}, or cable-N")
 
 
-def load(file_or_name: str | Path) -> Robot:
-    """Reads a robot file, or a shipped robot by its name; a file takes precedence."""
+def load(file_or_name: str | Path, count: Count | None = None) -> Robot:
+    """Reads a robot file, or a shipped robot by its name; a file takes precedence. count: of the modules, instead of
+    `modules` in the file."""
     path = Path(file_or_name)
     if path.is_dir():
         raise RobotFileError(f"{path} is a folder, expected a robot file; give the file, such as {path / 'robot.toml'}")
     if path.is_file():
-        return parse(read_text(path, RobotFileError), str(path))
-    return shipped(str(file_or_name))
+        return parse(read_text(path, RobotFileError), str(path), count)
+    return shipped(str(file_or_name), count)
 
 
 def folder_of(file_or_name: str | Path) -> Path:
@@ -208,7 +211,7 @@ def folder_of(file_or_name: str | Path) -> Path:
     return path.parent if path.is_file() else Path()
 
 
-def shipped(name: str) -> Robot:
+def shipped(name: str, count: Count | None = None) -> Robot:
     """A shipped robot by its name, regardless of files."""
     try:
         text = text_of(name)
@@ -218,27 +221,34 @@ def shipped(name: str) -> Robot:
             f"{', '.join(names())}, cable-N (modsoft-runtime --print-robot pneumatic-3 > robot.toml makes one to start "
             "from)"
         ) from None
-    return parse(text, name)
+    return parse(text, name, count)
 
 
-def parse(text: str, where: str = "robot file") -> Robot:
-    """Parses the text of a robot file; where: name of the file, for errors."""
+def parse(text: str, where: str = "robot file", count: Count | None = None) -> Robot:
+    """Parses the text of a robot file; where: name of the file, for errors; count: see `load`."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise RobotFileError(f"{where}: not valid TOML: {error}") from error
-    return from_dict(table, where)
+    return from_dict(table, where, count)
 
 
-def from_dict(table: dict[str, Any], where: str = "robot") -> Robot:
-    """Converts plain values (of a checkpoint, ONNX metadata, TOML) to `Robot`, with the same checks as the file."""
+def from_dict(table: dict[str, Any], where: str = "robot", count: Count | None = None) -> Robot:
+    """Converts plain values (of a checkpoint, ONNX metadata, TOML) to `Robot`, with the same checks as the file.
+    Entries of modules that the robot does not have are checked and dropped."""
     table = layout.with_preset(table, where)
+    robot = _converted(table, where)
+    if count is not None:
+        robot = _converted({**table, "robot": {**table["robot"], "modules": count(robot)}}, where)
+    _check(robot, where)
+    return modules.first_entries(robot)
+
+
+def _converted(table: dict[str, Any], where: str) -> Robot:
     try:
-        robot = msgspec.convert(table, Robot)
+        return msgspec.convert(table, Robot)
     except msgspec.ValidationError as error:
         raise RobotFileError(f"{where}: {explain(table, Robot, error)}") from error
-    _check(robot, where)
-    return robot
 
 
 def _check(robot: Robot, where: str) -> None:
@@ -247,9 +257,7 @@ def _check(robot: Robot, where: str) -> None:
     def refuse(found: str, expected: str) -> NoReturn:
         raise RobotFileError(f"{where}: {found}; expected {expected}")
 
-    count = robot.modules
-    if robot.tracker.tools and len(robot.tracker.tools) != count + 1:
-        refuse(f"tracker.tools has {len(robot.tracker.tools)} entries", f"{count + 1}: base, then modules 1 to {count}")
+    modules.check_tools(robot, refuse)
     layout.check_actuators(robot.motion, robot.actuators, robot.simulation, refuse)
     if robot.actuators.drive == "cables":
         if robot.valve is not None or robot.chambers:
@@ -270,26 +278,4 @@ def _check(robot: Robot, where: str) -> None:
             f"[sensors] zero_v {robot.sensors.zero_v}, full_v {robot.sensors.full_v}",
             f"full_v at least {LEAST_SENSOR_SPAN_V} V above zero_v",
         )
-    _check_chambers(robot, refuse)
-
-
-def _check_chambers(robot: Robot, refuse: Callable[[str, str], NoReturn]) -> None:
-    """Whether every module has all of its chambers, each on a channel of its own."""
-    count, degrees = robot.modules, robot.actuators.directions_deg
-    required = Counter((module, direction) for module in range(1, count + 1) for direction in degrees)
-    chambers = Counter((chamber.module, chamber.direction_deg) for chamber in robot.chambers)
-    if chambers != required:
-        wrong = [
-            f"{label}: {', '.join(f'module {module} at {direction:g}' for module, direction in sorted(places))}"
-            for label, places in (("missing", required - chambers), ("too many", chambers - required))
-            if places
-        ]
-        refuse(
-            f"[[chambers]] of {count} modules, {'; '.join(wrong)} degrees",
-            f"one chamber at each of {layout.listed(degrees)} degrees for each module from 1 to {count}: "
-            "add or delete [[chambers]], or correct modules under [robot]",
-        )
-    channels = Counter(chamber.channel for chamber in robot.chambers)
-    twice = sorted(channel for channel, uses in channels.items() if uses > 1)
-    if twice:
-        refuse(f"valve channel {twice[0]} is used by two chambers", "a different channel for each")
+    modules.check_chambers(robot, refuse)

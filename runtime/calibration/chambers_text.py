@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,10 +18,15 @@ _CHAMBER = re.compile(r"\s*\[\[\s*chambers\s*\]\]\s*(#.*)?$")
 
 
 def with_chambers(text: str, chambers: Sequence[Chamber], where: str) -> str:
-    """`text` with channel, gain and offset_bar of these chambers, in the order of the file. `RobotFileError` for a file
-    whose chambers are not written as [[chambers]] tables."""
+    """`text` with channel, gain and offset_bar of these chambers, in the order of the file; those of modules that the
+    robot does not have stay as they are. `RobotFileError` for a file whose chambers are not written as [[chambers]]
+    tables."""
     lines = text.splitlines()
     starts = [number for number, line in enumerate(lines) if _CHAMBER.match(line)]
+    tables = tomllib.loads(text).get("chambers", [])
+    if len(starts) == len(tables):
+        modules = {chamber.module for chamber in chambers}
+        starts = [start for start, table in zip(starts, tables, strict=True) if table.get("module") in modules]
     if len(starts) == len(chambers):
         for start, chamber in reversed(list(zip(starts, chambers, strict=True))):
             ends = (number for number in range(start + 1, len(lines)) if _HEADER.match(lines[number]))

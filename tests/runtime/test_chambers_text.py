@@ -45,6 +45,14 @@ def test_gain_and_offset_are_added_and_replaced():
     assert len(again.splitlines()) == len(once.splitlines())
 
 
+def test_chambers_of_unused_modules_stay():
+    text = TEXT.replace("modules = 3", "modules = 2")
+    chambers = changed(channel=1)[:4]
+    after = with_chambers(text, chambers, "robot.toml")
+    assert robot_file.parse(after).chambers == chambers
+    assert robot_file.parse(after.replace("modules = 2", "modules = 3")).chambers == changed(channel=1)
+
+
 def test_tables_after_the_chambers_and_between_them_stay():
     head, _, tables = TEXT.partition("# the chamber at 180")
     loop, _, rest = head.partition("[loop]")[2].partition("[valve]")

@@ -162,6 +162,13 @@ def test_missing_user_is_reported_at_once(tmp_path, redirected):
     assert "give --yes" in line
 
 
+@pytest.mark.parametrize("modules", ["1", "65", "all", "2.0"])
+def test_invalid_number_of_modules_is_refused(modules):
+    done = run("--modules", modules)
+    assert done.returncode == 2
+    assert f"found '{modules}', expected a number from 2 to 64, or auto" in done.stderr
+
+
 def test_version():
     assert run("--version").stdout.startswith("modsoft-runtime, version ")
 

@@ -160,7 +160,7 @@ def test_cables_pull_and_chambers_push():
             r"modules under \[robot\]: found 1; .* at least 2 and at most 64$",
         ),
         (PNEUMATIC.replace('name = "pneumatic-3"', 'name = "my arm"'), "found 'my arm'; expected text"),
-        (PNEUMATIC.replace("modules = 3", "modules = 2"), "too many: module 3 at 0, module 3 at 180 degrees; expected"),
+        (PNEUMATIC.replace("direction_deg = 0", "direction_deg = 180"), "too many: module 1 at 180, module 2 at 180, "),
         (PNEUMATIC.replace("modules = 3", "modules = 4"), "missing: module 4 at 0, module 4 at 180 degrees; expected"),
         (PNEUMATIC.replace("tools = []", "tools = [1]"), r"tools number 1 under \[tracker\]: found 1; expected text"),
         (PNEUMATIC.replace("tools = []", "tools = 7"), r"tools under \[tracker\]: found 7; expected a list$"),
