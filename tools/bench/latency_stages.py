@@ -137,7 +137,7 @@ class StampedPort:
 
 def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict[str, float]]:
     """Milliseconds of every stage of the ticks that passed all stages. `warm`: with the runtime's warm-up."""
-    robot, stamps, lines, written = robot_of(modules, HZ), Stamps(), list[Stamps](), list[float]()
+    robot, stamps, stamps_of_ticks, written = robot_of(modules, HZ), Stamps(), list[Stamps](), list[float]()
     frame_bytes = len(encode(Set(0, (0,) * CHANNELS)))
     with tempfile.TemporaryDirectory() as folder, EmulatedBoard() as emulated:
         port, tools = Path(folder) / "ttyPolaris", write_tool_files(Path(folder), modules + 1)
@@ -150,14 +150,14 @@ def ticks(modules: int, count: int, model: Path, warm: bool = True) -> list[dict
             reader = Reader(open_source(robot, str(port), tools), latest)
             board = Board(StampedPort(open_port(emulated.port, robot.serial.baud), frame_bytes, written), emulated.port)
             board.arm(robot)
-            _run_loop(robot, Model.load(model), latest, board, tracker, count, warm, stamps, lines)
+            _run_loop(robot, Model.load(model), latest, board, tracker, count, warm, stamps, stamps_of_ticks)
             board.close()
             reader.close()
         finally:
             tracker.stop()
         changes = np.array([event["mono_ns"] for event in emulated.trace if event["event"] == "pwm"]) * 1e-9
     wire_s = frame_bytes * 10 / robot.serial.baud
-    rows = (stages(line, latest.frames, np.array(written), changes, wire_s) for line in lines)
+    rows = (stages(each, latest.frames, np.array(written), changes, wire_s) for each in stamps_of_ticks)
     return [row for row in rows if row is not None]
 
 
@@ -170,9 +170,9 @@ def _run_loop(
     count: int,
     warm: bool,
     stamps: Stamps,
-    lines: list[Stamps],
+    stamps_of_ticks: list[Stamps],
 ) -> None:
-    """Runs the loop for `count` ticks; adds the stamps and the frame number of each tick to `lines`."""
+    """Runs the loop for `count` ticks; adds the stamps and the frame number of each tick to the list."""
     model.warm_up(robot.modules)
     stop, start_s = Stop(), time.monotonic()
 
@@ -184,7 +184,7 @@ def _run_loop(
     def log(record: Record) -> None:
         if isinstance(record, TickRecord) and record.sent and record.frame_status == "good":
             assert record.frame is not None
-            lines.append({**stamps, "number": record.frame.number})
+            stamps_of_ticks.append({**stamps, "number": record.frame.number})
 
     validator = FrameValidator(robot)
     Loop(
@@ -203,18 +203,22 @@ def _run_loop(
 
 
 def stages(
-    line: Stamps, frames: dict[int, tuple[float, float]], written: Any, changes: Any, wire_s: float
+    stamps: Stamps, frames: dict[int, tuple[float, float]], written: Any, changes: Any, wire_s: float
 ) -> dict[str, float] | None:
-    """Milliseconds of the stages of one tick; None if no register had to change or one was still changing."""
-    tracker_s, frame_s = frames[int(line["number"])]
-    writes = written[written >= line["pressures"]]
+    """Milliseconds of the stages of one tick; None if no register had to change or one was still changing.
+
+    stamps: of the tick, with the number of its frame. frames: times of the tracker's answer and the frame, by number.
+    written: times of all writes of set-points. changes: times of all changes of registers. wire_s: of the set-points.
+    """
+    tracker_s, frame_s = frames[int(stamps["number"])]
+    writes = written[written >= stamps["pressures"]]
     if not len(writes):
         return None
     written_s = writes[0]
-    changed = changes[(changes >= line["pressures"]) & (changes <= written_s + wire_s + REGISTER_WAIT_S)]
+    changed = changes[(changes >= stamps["pressures"]) & (changes <= written_s + wire_s + REGISTER_WAIT_S)]
     if not len(changed) or changed[0] < written_s + wire_s:
         return None
-    in_loop_s = [line[name] for name in ("taken", "features", "actuation", "pressures")]
+    in_loop_s = [stamps[name] for name in ("taken", "features", "actuation", "pressures")]
     spans_s = [frame_s - tracker_s, *np.diff([*in_loop_s, written_s, written_s + wire_s, changed[0]])]
     by_stage = {stage: 1e3 * float(span_s) for stage, span_s in zip(STAGES, spans_s, strict=True)}
     return {**by_stage, "ours": sum(by_stage[stage] for stage in OURS), "all": sum(by_stage.values())}
