@@ -1,8 +1,8 @@
-"""Reach of simulated robots: how far each module bends alone, at the largest action, the others at 0.
+"""Reach of simulated robots: how far each module bends at the largest action, with the other modules at 0.
 
-`python tools/bench/reach.py pneumatic-3 pneumatic-2`. Every module is held at the largest action in `DIRECTIONS`
-directions, in the plane in both, for `PERIODS` control periods from rest. The smallest bending angle is shown, in
-degrees, base first.
+`python tools/bench/reach.py pneumatic-3 pneumatic-2`. The module is held at the largest action for `PERIODS` control
+periods from rest, in each of `DIRECTIONS` directions, or in both directions of a plane. The table shows the smallest
+bending angle of each module in degrees, base first.
 """
 
 from __future__ import annotations
