@@ -159,6 +159,24 @@ ROWS: dict[int, Row] = {
         "pull-downs vent; the host names the cause",
         "down in 250 ms with pull-downs; back after power off",
     ),
+    50: Row(
+        "calibration of another robot, or of fewer modules",
+        "refused before any device is opened",
+        "all; one line that names the command to run",
+    ),
+    51: Row("calibration of other tools", "refused before any device is opened", "each tool"),
+    52: Row("damaged calibration file", "refused, or the values that it states", "200 of 200 damaged files, one line"),
+    53: Row(
+        "tool moved since the calibration",
+        "refused at rest, before arming",
+        "8 degrees and more, about any axis; no false alarm with 0.5 degree of noise",
+    ),
+    54: Row(
+        "robot moves, or is bent, during modsoft-calibrate rest",
+        "refused, the calibration stays",
+        "swings of 1 degree a module, drifts of 2 degrees a second, one module bent by 40 degrees, all by 15",
+    ),
+    55: Row("tool hidden during modsoft-calibrate rest", "refused, the calibration stays", "named within 6 s"),
     56: Row(
         "hoses in any order (modsoft-calibrate channels)",
         "channel of every chamber recognised",

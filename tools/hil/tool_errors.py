@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import random
 from typing import NamedTuple
@@ -23,9 +24,7 @@ class ToolErrors(NamedTuple):
         """The pose of a tool (0 is the base's) where its mounting holds it: turned and moved in a random direction."""
         if tool == 0 or not (self.mounting_deg or self.mounting_mm):
             return pose
-        chance = random.Random(f"{self.seed}, tool {tool}")
-        angle, distance = chance.uniform(0.0, self.mounting_deg), chance.uniform(0.0, self.mounting_mm)
-        return after(pose, _turn([angle * x for x in _direction(chance)]), [distance * x for x in _direction(chance)])
+        return after(pose, *_mounting(self.mounting_deg, self.mounting_mm, self.seed, tool))
 
     def measured(self, number: int, poses: list[Pose]) -> list[Pose]:
         """The poses in frame `number` of the device."""
@@ -41,6 +40,14 @@ class ToolErrors(NamedTuple):
 
 
 NO_ERRORS = ToolErrors()
+
+
+@functools.lru_cache(maxsize=256)
+def _mounting(largest_deg: float, largest_mm: float, seed: int, tool: int) -> tuple[Pose, list[float]]:
+    """Rotation (3, 3) and position in mm of a tool."""
+    chance = random.Random(f"{seed}, tool {tool}")
+    angle, distance = chance.uniform(0.0, largest_deg), chance.uniform(0.0, largest_mm)
+    return _turn([angle * x for x in _direction(chance)]), [distance * x for x in _direction(chance)]
 
 
 def _direction(chance: random.Random) -> list[float]:
