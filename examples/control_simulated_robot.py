@@ -17,7 +17,7 @@ def main() -> None:
     model = Model.load(Path(sys.argv[1]) if len(sys.argv) > 1 else SHIPPED)
     model.check(robot)  # raises an error if it was trained for another kind of robot
     desired = task("down", "planar", robot.modules)  # (K, N, 3), one configuration a control step
-    simulator = simulated("pneumatic", robot.modules, 1)
+    simulator = simulated(robot, 1)
     run = rollout(simulator, [ControllerSetup(robot, model.actuate, model.history, desired)]).robots()[0]
     for module, error in enumerate(angle_errors_deg(run.configuration, desired).mean(axis=0), start=1):
         print(f"module {module}: mean error of the bending angle {error:.2f} degrees")

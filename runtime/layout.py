@@ -1,4 +1,4 @@
-"""The layout of a module: its motion, and the actuators in the robot file; presets, and files of version 0.1."""
+"""The layout of a module: its motion, and the actuators in the robot file; files of version 0.1."""
 
 from __future__ import annotations
 
@@ -43,19 +43,11 @@ class Actuators(Section, frozen=True):
     directions_deg: tuple[Annotated[float, Meta(ge=0.0, lt=360.0)], ...]
 
 
-class Simulation(Section, frozen=True):
-    """`[simulation]`: physical parameters of the simulated robot. A robot without it can only be real."""
-
-    preset: Literal["cable", "pneumatic", "pneumatic-2"]
-
-
 # `kind` under [robot], in files of version 0.1: motion and actuators. It is the name of a preset, too.
 KINDS: dict[str, tuple[str, Actuators]] = {
     "cable": ("spatial", Actuators(drive="cables", directions_deg=(0.0, 180.0, 90.0, 270.0))),
     "pneumatic": ("planar", Actuators(drive="chambers", directions_deg=(180.0, 0.0))),
 }
-# Motion and actuators of the robots that can be simulated.
-PRESETS = {**KINDS, "pneumatic-2": KINDS["pneumatic"]}
 _DIRECTION_OF_SIDE = {"+": 180.0, "-": 0.0}  # `side` of a chamber in such a file
 
 
@@ -106,11 +98,8 @@ def _with_direction(chamber: Any) -> Any:
     return {**others, "direction_deg": _DIRECTION_OF_SIDE[chamber["side"]]}
 
 
-def check_actuators(
-    motion: str, actuators: Actuators, simulation: Simulation | None, refuse: Callable[[str, str], NoReturn]
-) -> None:
-    """Calls refuse(found, expected) unless the actuators can bend a module in every direction of its motion, and are
-    those of the preset."""
+def check_actuators(motion: str, actuators: Actuators, refuse: Callable[[str, str], NoReturn]) -> None:
+    """Calls refuse(found, expected) unless the actuators can bend a module in every direction of its motion."""
     degrees = actuators.directions_deg
     place = "directions_deg under [actuators]: found"
     twice = sorted(each for each, uses in Counter(degrees).items() if uses > 1)
@@ -130,14 +119,6 @@ def check_actuators(
             f"{place} {listed(degrees)}{between}",
             f"at most {LARGEST_GAP_DEG:g} degrees between neighbours, so that a module bends in every direction: "
             'add an actuator, or write motion = "planar" under [robot]',
-        )
-    if simulation is not None and (motion, actuators) != PRESETS[simulation.preset]:
-        of_preset, others = PRESETS[simulation.preset]
-        refuse(
-            f"preset {simulation.preset!r} under [simulation] of a {motion} robot with {actuators.drive} at "
-            f"{listed(degrees)} degrees",
-            f"a {of_preset} one with {others.drive} at {listed(others.directions_deg)}: "
-            "delete [simulation], the robot then cannot be simulated",
         )
 
 

@@ -16,10 +16,11 @@ from typing import Annotated, Any, Literal, NoReturn
 import msgspec
 from msgspec import Meta
 
-from modsoft.runtime import layout, modules
+from modsoft.runtime import layout, modules, physics
 from modsoft.runtime.errors import RobotFileError
 from modsoft.runtime.files import read_text
-from modsoft.runtime.layout import MOTIONS, Actuators, Section, Simulation
+from modsoft.runtime.layout import MOTIONS, Actuators, Section
+from modsoft.runtime.physics import Simulation
 from modsoft.runtime.validation_messages import explain
 
 LEAST_SENSOR_SPAN_V = 1.0  # as in firmware/limits.h
@@ -146,11 +147,11 @@ class Robot(Section, frozen=True):
         return self.robot.motion
 
     @property
-    def preset(self) -> str:
-        """Preset of the simulated robot. `RobotFileError` for a robot that cannot be simulated."""
+    def physics(self) -> Simulation:
+        """All parameters of the simulated robot. `RobotFileError` for a robot that cannot be simulated."""
         if self.simulation is None:
             raise RobotFileError(f"robot {self.name} has no [simulation], expected one: it is simulated here")
-        return self.simulation.preset
+        return physics.resolved(self.simulation)
 
     @property
     def state_size(self) -> int:
@@ -258,8 +259,11 @@ def _check(robot: Robot, where: str) -> None:
         raise RobotFileError(f"{where}: {found}; expected {expected}")
 
     modules.check_tools(robot, refuse)
-    layout.check_actuators(robot.motion, robot.actuators, robot.simulation, refuse)
+    layout.check_actuators(robot.motion, robot.actuators, refuse)
+    complete = None if robot.simulation is None else physics.resolved(robot.simulation, where)
     if robot.actuators.drive == "cables":
+        if complete is not None and complete.cable_stress_pa is None:
+            refuse("[simulation] of a cable robot without cable_stress_pa", "one, or the preset cable")
         if robot.valve is not None or robot.chambers:
             refuse("a cable robot with [valve] or [[chambers]]", "neither: cable robots are simulated")
         return

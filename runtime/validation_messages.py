@@ -47,8 +47,12 @@ def _walk(value: Any, expected: Any, path: list[str]) -> tuple[list[str], Any, A
 
 def _plain(expected: Any) -> Any:
     """The type without limits and without None."""
-    if get_origin(expected) is Annotated:
-        return _plain(get_args(expected)[0])
+    expected = _present(expected)
+    return get_args(expected)[0] if get_origin(expected) is Annotated else expected
+
+
+def _present(expected: Any) -> Any:
+    """The type without None."""
     types = [entry for entry in get_args(expected) if entry is not type(None)]
     return types[0] if type(None) in get_args(expected) else expected
 
@@ -91,7 +95,7 @@ def _allowed(expected: Any, reason: str) -> str:
     description = TYPE_NAMES.get(_plain(expected))
     if description is None:
         return "a table" if "`object`" in reason or "missing" in reason else "a list"
-    limits = [entry for entry in get_args(expected)[1:] if isinstance(entry, Meta)]
+    limits = [entry for entry in get_args(_present(expected))[1:] if isinstance(entry, Meta)]
     for limit in limits:
         bounds = {"above": limit.gt, "at least": limit.ge, "below": limit.lt, "at most": limit.le}
         limits_text = [f"{name} {bound:g}" for name, bound in bounds.items() if bound is not None]

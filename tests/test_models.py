@@ -10,6 +10,7 @@ from modsoft.runtime.control import tasks
 from modsoft.runtime.control.model import Model
 from modsoft.training.simulation import fleet_kernel, rollout
 from modsoft.training.simulation.fleet import Fleet
+from modsoft.training.simulation.parameters import plant_of
 from modsoft.training.simulation.rollout import ControllerSetup
 
 pytestmark = pytest.mark.instructions
@@ -42,7 +43,7 @@ def test_shipped_model_controls_its_robot(file, robot, task, limit):
     controller = Model.load(MODELS / f"{file}.onnx")
     desired = tasks.task(task, robot.motion, robot.modules)[:60]
     setup = ControllerSetup(robot, controller.actuate, controller.history, desired)
-    (run,) = rollout.rollout(Fleet(robot.preset, robot.modules, 1), [setup]).robots()
+    (run,) = rollout.rollout(Fleet(plant_of(robot), robot.modules, 1), [setup]).robots()
     errors = rollout.angle_errors_deg if robot.motion == "planar" else rollout.configuration_errors_percent
     assert errors(run.configuration, desired).mean(axis=0).max() < limit
     at_rest = np.broadcast_to(run.configuration[:1], (61, robot.modules, 3))

@@ -14,6 +14,7 @@ from modsoft.runtime.errors import ModelError, ModsoftError
 from modsoft.runtime.files import NOT_AN_ARRAY, check_not_input, check_writable, written
 from modsoft.runtime.robot import Robot
 from modsoft.training.simulation.fleet import Arms
+from modsoft.training.simulation.parameters import plant_of
 from modsoft.training.simulation.rollout import rollout
 
 
@@ -48,7 +49,7 @@ def simulate(robot: Robot, actions: Array) -> dict[str, Array]:
     positions (steps + 1, N, 3), m; directors (steps + 1, N, 3, 3), rows d1, d2, d3. Raises `ModsoftError` if the
     simulation diverges.
     """
-    arms = Arms(robot.preset, robot.modules, 1)
+    arms = Arms(plant_of(robot), robot.modules, 1)
     (run,) = rollout(arms, actions[:, None], period_s=robot.loop.period_s).robots()
     if not arms.alive[0]:
         step = int(np.isnan(run.configuration).any(axis=(1, 2)).argmax()) - 1

@@ -71,8 +71,9 @@ def run(folder, robot, model, steps):
 def as_in_collection(recorded, run_folder):
     """Configurations at the ticks (K, N, 3) of the robot that training data comes from, given what the run applied."""
     from modsoft.training.simulation.elastica import Arm
+    from modsoft.training.simulation.parameters import plant_of
 
-    arm = Arm(recorded.robot.preset, recorded.robot.modules)
+    arm = Arm(plant_of(recorded.robot), recorded.robot.modules)
     arm.step(np.zeros((recorded.robot.modules, 1)))  # the period before the first tick
     there = []
     for tick in read(run_folder).ticks:

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from modsoft.runtime import physics
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import RobotFileError
 
@@ -23,7 +24,7 @@ from modsoft.runtime.errors import RobotFileError
 )
 def test_shipped_robots(name, preset, modules, state, action):
     robot = robot_file.load(name)
-    assert (robot.name, robot.preset, robot.modules) == (name, preset, modules)
+    assert (robot.name, robot.simulation.preset, robot.modules) == (name, preset, modules)
     assert (robot.state_size, robot.action_size) == (state, action)
 
 
@@ -79,6 +80,11 @@ THREE += "\n".join(
 )
 
 
+def with_physics(line):
+    """pneumatic-3 with a line more under [simulation]."""
+    return PNEUMATIC.replace('preset = "pneumatic"', f'{line}\npreset = "pneumatic"')
+
+
 def version_0_1(text):
     """A robot file with `kind` in place of motion, actuators and preset, as version 0.1 wrote it."""
     kind = "cable" if 'drive = "cables"' in text else "pneumatic"
@@ -105,7 +111,31 @@ def test_robot_with_three_chambers_a_module():
     np.testing.assert_allclose(robot.directions, [[-1, 0], [0.5, -half], [0.5, half]], atol=1e-15)
     assert [robot.actuator_of(chamber) for chamber in robot.chambers] == [0, 1, 2] * 3
     with pytest.raises(RobotFileError, match=r"no \[simulation\], expected one"):
-        robot.preset  # noqa: B018
+        robot.physics  # noqa: B018
+
+
+def test_values_under_simulation_replace_those_of_the_preset():
+    changed = robot_file.parse(with_physics("module_length_m = 0.08\ndrag_axial = 0.1")).physics
+    preset = robot_file.load("pneumatic-3").physics
+    assert (changed.module_length_m, changed.drag_axial) == (0.08, 0.1)
+    assert msgspec.structs.replace(changed, module_length_m=0.054, drag_axial=None) == preset
+    two = robot_file.load("pneumatic-2").physics  # a preset with another one
+    assert msgspec.structs.replace(two, youngs_modulus_pa=100.8e3, stiffening_weight_n=0.1555) == preset
+
+
+def test_simulation_without_a_preset_has_every_value():
+    values = msgspec.structs.asdict(robot_file.load("pneumatic-3").physics)
+    lines = "\n".join(f"{name} = {value}" for name, value in values.items() if value not in (None, ""))
+    text = re.sub(r"preset = .*", "", PNEUMATIC).replace("[simulation]", f"[simulation]\n{lines}")
+    robot = robot_file.parse(re.sub(r"actuator_weight = \((.*)\)", r"actuator_weight = [\1]", text))
+    assert robot.physics == robot_file.load("pneumatic-3").physics
+    assert robot_file.from_dict(robot.to_dict()) == robot
+
+
+def test_presets_are_complete():
+    assert physics.presets() == ["cable", "pneumatic", "pneumatic-2"]
+    for name in physics.presets():
+        assert physics.resolved(robot_file.Simulation(preset=name)).preset == ""
 
 
 def test_cables_pull_and_chambers_push():
@@ -151,8 +181,17 @@ def test_cables_pull_and_chambers_push():
             THREE.replace("[0, 120, 240]", "[0, 120, 250]"),
             "missing: .* 3 at 250; too many: .* 3 at 240 degrees; .* 0, 120",
         ),
-        (THREE.replace("[loop]", '[simulation]\npreset = "cable"\n[loop]'), "'cable' .* with chambers at 0, 120, 240"),
-        (PNEUMATIC.replace("[180, 0]", "[0, 180]"), "chambers at 0, 180 degrees; expected a planar one .* at 180, 0"),
+        (THREE.replace("[loop]", '[simulation]\npreset = "cables"\n[loop]'), "'cables', did you mean 'cable'.* one of"),
+        (THREE.replace("[loop]", "[simulation]\n[loop]"), "without module_length_m, elements, .* expected a preset"),
+        (with_physics("length_m = 0.1"), "unknown key 'length_m' under .*, did you mean 'module_length_m'"),
+        (with_physics("radius_m = 0"), r"radius_m under \[simulation\]: found 0; expected a number above 0$"),
+        (
+            with_physics("elements = 1"),
+            r"elements under \[simulation\]: found 1; expected a whole number at least 2 and",
+        ),
+        (with_physics("radius_m = 0.01"), "actuator_offset_m .* found 0.0105; expected less than radius_m, 0.01$"),
+        (with_physics("actuator_weight = []"), r"actuator_weight under .* found \[\]; expected a list"),
+        (CABLE.replace('preset = "cable" ', 'preset = "pneumatic" '), "without cable_stress_pa; expected one, or the"),
         (PNEUMATIC.replace('"0-10 V"', '"4-20 mA"'), r"signal under \[valve\]: found '4-20 mA'; expected '0-10 V'$"),
         (PNEUMATIC.replace("baud = 250000", "baud = 9600"), "found 9600; expected one of 115200, 250000"),
         (

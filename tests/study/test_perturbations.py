@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from plants import CABLE
 
 from modsoft.runtime.control.features import angle_between_deg
 from modsoft.study import perturbations
-from modsoft.training.simulation.parameters import CABLE
 
 BENT = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, -0.8, 0.6]])
 

@@ -14,6 +14,7 @@ from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.errors import ModelError, OutputError, UsageError
 from modsoft.training.data import actions, coverage, dataset
 from modsoft.training.simulation.elastica import Arm
+from modsoft.training.simulation.parameters import plant_of
 
 
 def test_straight_robot_is_on_its_axis():
@@ -39,7 +40,7 @@ def test_module_is_rotated_with_the_previous_one():
 @pytest.mark.parametrize(("name", "farthest_m"), [("pneumatic-3", 0.010), ("cable-4", 0.030)])
 def test_arcs_are_close_to_the_simulated_robot(name, farthest_m):
     robot = robot_file.load(name)
-    arm = Arm(robot.preset, robot.modules)
+    arm = Arm(plant_of(robot), robot.modules)
     arm.step(np.full((robot.modules, robot.action_size), 0.4), 0.4)
     ends = coverage.module_ends(arm.configuration, arm.parameters.module_length_m)
     assert np.abs(arm.positions[:, 0]).max() > 3e-3

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plants import CABLE, PARAMETERS, PNEUMATIC, PNEUMATIC_2
 
 from modsoft.runtime.control.actuation import activations
 from modsoft.runtime.control.features import bending_angle_deg
 from modsoft.runtime.control.tasks import DOWN_DEG, EDGE_DEG
 from modsoft.runtime.errors import ModsoftError
-from modsoft.training.simulation import elastica as arm_module
 from modsoft.training.simulation.elastica import Arm
-from modsoft.training.simulation.parameters import CABLE, P_MAX_BAR, P_MIN_BAR
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 DATA = Path(__file__).parent / "data"
+P_MIN_BAR, P_MAX_BAR = 0.08, 0.35
 
 
 @pytest.mark.parametrize("task", ["a", "b", "c"])
@@ -29,7 +29,7 @@ def test_recorded_actions_give_the_recorded_configurations(task):
         actions = run["act_list"]
         recorded = np.moveaxis(run["real_list"], -1, 0)[..., [1, 2, 0]]  # stored [v_z, v_x, v_y]
         ends = np.moveaxis(run["pos_list"], -1, 0)
-    arm = Arm("cable", 4)
+    arm = Arm(CABLE, 4)
     for step in range(50):
         assert np.abs(arm.configuration - recorded[step]).max() < 5e-6
         assert np.abs(arm.positions - ends[step]).max() < 1e-6
@@ -40,7 +40,7 @@ def test_recorded_actions_give_the_recorded_configurations(task):
 def test_robots_repeat_their_stored_traces(kind):
     """Stored from this simulation: store them again after an intended change of its numbers."""
     with np.load(DATA / f"{kind}-3.npz") as trace:
-        arm = Arm(kind, 3)
+        arm = Arm(PARAMETERS[kind], 3)
         for action, configuration, positions in zip(
             trace["actions"], trace["configuration"], trace["positions"], strict=True
         ):
@@ -50,7 +50,7 @@ def test_robots_repeat_their_stored_traces(kind):
 
 def test_cables_have_no_stress_at_rest():
     """Without actuation the cable robot only stretches, along its axis."""
-    arm = Arm("cable", 2)
+    arm = Arm(CABLE, 2)
     arm.step(np.zeros((2, 2)))
     assert np.abs(arm.configuration - [0.0, 0.0, 1.0]).max() < 1e-12
     assert 0.05 < arm.positions[0, 2] < 0.051
@@ -65,7 +65,7 @@ def settled_deg(arm, actuation, periods=4):
 
 @pytest.fixture(scope="module", name="pneumatic")
 def _pneumatic():
-    return {3: Arm("pneumatic", 3), 2: Arm("pneumatic-2", 2)}
+    return {3: Arm(PNEUMATIC, 3), 2: Arm(PNEUMATIC_2, 2)}
 
 
 @pytest.mark.parametrize(("modules", "reach_deg"), [(3, [5.9, 36.0, 90.0]), (2, [33.0, 75.0])])
@@ -188,23 +188,21 @@ def test_reset_restores_every_bit(pneumatic):
     first = [arm.step(action) for action in actions]
     arm.reset()
     assert np.array_equal(first, [arm.step(action) for action in actions])
-    fresh = Arm("pneumatic", 3)
+    fresh = Arm(PNEUMATIC, 3)
     assert np.array_equal(first, [fresh.step(action) for action in actions])
 
 
 @pytest.mark.parametrize("modules", [4, 8])
 def test_longer_pneumatic_robots_stay_bounded(modules):
-    arm = Arm("pneumatic", modules)
+    arm = Arm(PNEUMATIC, modules)
     for action in np.random.default_rng(7).choice([-1.0, 1.0], (4, modules, 1)):
         arm.step(action)
     assert np.abs(bending_angle_deg(arm.configuration)).max() < 130.0
 
 
-def test_state_that_is_not_finite_is_one_line(monkeypatch):
-    too_large = dataclasses.replace(CABLE, time_step_s=1e-3)
-    monkeypatch.setitem(arm_module.PARAMETERS, "cable", too_large)
-    arm = Arm("cable", 2)
-    with pytest.raises(ModsoftError, match=r"simulated cable robot of 2 modules is no longer finite"):
+def test_state_that_is_not_finite_is_one_line():
+    arm = Arm(dataclasses.replace(CABLE, time_step_s=1e-3), 2)
+    with pytest.raises(ModsoftError, match=r"simulated robot of 2 modules is no longer finite"):
         arm.step(np.ones((2, 2)), 5.0)
 
 
@@ -219,4 +217,4 @@ def test_invalid_arguments_are_refused(pneumatic):
     with pytest.raises(ValueError, match=r"found shape \(2,\), expected \(2, 2\)"):
         arm.set_pressures(np.zeros(2))
     with pytest.raises(ValueError, match="no chambers"):
-        Arm("cable", 2).set_pressures(np.zeros((2, 4)))
+        Arm(CABLE, 2).set_pressures(np.zeros((2, 4)))

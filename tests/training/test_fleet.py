@@ -1,17 +1,21 @@
 """The fleet against PyElastica, against the recorded runs, and against itself at other positions in a batch."""
 
+import dataclasses
 import json
 from pathlib import Path
 
 import benchmarks
 import numpy as np
 import pytest
+from plants import CABLE, PARAMETERS, PNEUMATIC
 
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import ModsoftError, UsageError
+from modsoft.runtime.layout import bending_directions
 from modsoft.training.simulation import fleet, fleet_kernel
 from modsoft.training.simulation.elastica import Arm
 from modsoft.training.simulation.fleet import Arms, Fleet
-from modsoft.training.simulation.parameters import PARAMETERS, Perturbation
+from modsoft.training.simulation.parameters import Perturbation
 from modsoft.training.simulation.rollout import rollout
 
 pytestmark = pytest.mark.instructions
@@ -33,7 +37,7 @@ def actions(kind, periods, count, modules, seed=0, largest=1.0):
 
 
 def arm_run(kind, modules, drawn):
-    arm = Arm(kind, modules)
+    arm = Arm(PARAMETERS[kind], modules)
     configuration = [arm.configuration]
     for action in drawn:
         arm.step(action)
@@ -44,7 +48,7 @@ def arm_run(kind, modules, drawn):
 def largest_difference(kind, modules, periods, seed):
     """Between the fleet and PyElastica, both with explicit damping, after every period of full-range random actions."""
     drawn = actions(kind, periods, 1, modules, seed)
-    configuration = configurations(Fleet(kind, modules, 1, damping="explicit"), drawn)
+    configuration = configurations(Fleet(PARAMETERS[kind], modules, 1, damping="explicit"), drawn)
     return np.abs(configuration[:, 0] - arm_run(kind, modules, drawn[:, 0])).max()
 
 
@@ -84,10 +88,13 @@ def test_equals_pyelastica_for_other_module_numbers(kind, modules, periods):
 def test_perturbed_robots_equal_pyelastica(kind, modules, periods, stiffness, payload_modules):
     changed = Perturbation(stiffness, payload_modules * PARAMETERS[kind].module_kg)
     drawn = actions(kind, periods, 1, modules, seed=modules)
-    robots = configurations(Fleet(kind, modules, 1, damping="explicit", perturbation=changed), drawn)[:, 0]
-    arm = configurations(Arms(kind, modules, 1, perturbation=changed), drawn)[:, 0]
+    robots = configurations(Fleet(PARAMETERS[kind], modules, 1, damping="explicit", perturbation=changed), drawn)[:, 0]
+    arm = configurations(Arms(PARAMETERS[kind], modules, 1, perturbation=changed), drawn)[:, 0]
     assert np.abs(robots - arm).max() < 1e-9
-    assert np.abs(robots - configurations(Fleet(kind, modules, 1, damping="explicit"), drawn)[:, 0]).max() > 0.02
+    assert (
+        np.abs(robots - configurations(Fleet(PARAMETERS[kind], modules, 1, damping="explicit"), drawn)[:, 0]).max()
+        > 0.02
+    )
 
 
 @needs_kernel
@@ -95,8 +102,8 @@ def test_softer_module_bends_further_and_the_others_change_little():
     """Nearly at rest the couple of the cables is the same."""
     drawn = np.broadcast_to([[0.3, 0.0]] * 3, (20, 1, 3, 2))
     stiff, soft = (
-        configurations(Fleet("cable", 3, 1), drawn),
-        configurations(Fleet("cable", 3, 1, perturbation=Perturbation([1.0, 0.8, 1.0])), drawn),
+        configurations(Fleet(CABLE, 3, 1), drawn),
+        configurations(Fleet(CABLE, 3, 1, perturbation=Perturbation([1.0, 0.8, 1.0])), drawn),
     )
     angle = np.degrees(np.arccos([stiff[-1, 0, :, 2], soft[-1, 0, :, 2]]))
     assert 1.1 < angle[1, 1] / angle[0, 1] < 1.4
@@ -108,7 +115,7 @@ def test_softer_module_bends_further_and_the_others_change_little():
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_perturbed_robots_stay_finite_under_full_range_jumps(modules, factor):
     drawn = np.random.default_rng(modules).choice([-1.0, 1.0], (3, 16, modules, 2))
-    robots = Fleet("cable", modules, 16, perturbation=Perturbation([factor] * modules, PARAMETERS["cable"].module_kg))
+    robots = Fleet(CABLE, modules, 16, perturbation=Perturbation([factor] * modules, PARAMETERS["cable"].module_kg))
     configurations(robots, drawn)
     assert robots.alive.all()
 
@@ -127,7 +134,7 @@ def test_invalid_stiffness_and_payload_are_refused(changed):
     makers = [Arm] if fleet_kernel.library() is None else [Arm, lambda *given, **more: Fleet(*given, 1, **more)]
     for make in makers:
         with pytest.raises(ValueError, match=r"expected 3 positive numbers|expected 0 or more"):
-            make("cable", 3, perturbation=changed)
+            make(CABLE, 3, perturbation=changed)
 
 
 @pytest.fixture(scope="module")
@@ -143,14 +150,14 @@ def recorded():
 @needs_kernel
 def test_replays_the_recorded_runs(recorded):
     drawn, configuration = recorded
-    replayed = configurations(Fleet("cable", 4, 3, damping="explicit"), drawn)
+    replayed = configurations(Fleet(CABLE, 4, 3, damping="explicit"), drawn)
     assert np.abs(replayed[:-1] - configuration).max() < 5e-6
 
 
 @needs_kernel
 def test_exponential_damping_stays_close_to_the_recorded_runs(recorded):
     drawn, configuration = recorded
-    replayed = configurations(Fleet("cable", 4, 3), drawn[:60])
+    replayed = configurations(Fleet(CABLE, 4, 3), drawn[:60])
     assert np.abs(replayed[:-1] - configuration[:60]).mean() < 2e-6
 
 
@@ -158,17 +165,19 @@ def test_exponential_damping_stays_close_to_the_recorded_runs(recorded):
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
 def test_results_are_independent_of_the_other_robots(kind):
     drawn = actions(kind, 2, 19, 3, seed=1)
-    together = configurations(Fleet(kind, 3, 19), drawn)
-    assert np.array_equal(together[:, 5:6], configurations(Fleet(kind, 3, 1), drawn[:, 5:6]))
+    together = configurations(Fleet(PARAMETERS[kind], 3, 19), drawn)
+    assert np.array_equal(together[:, 5:6], configurations(Fleet(PARAMETERS[kind], 3, 1), drawn[:, 5:6]))
     order = np.random.default_rng(2).permutation(19)
-    assert np.array_equal(together[:, order], configurations(Fleet(kind, 3, 19, threads=2), drawn[:, order]))
+    assert np.array_equal(
+        together[:, order], configurations(Fleet(PARAMETERS[kind], 3, 19, threads=2), drawn[:, order])
+    )
 
 
 @needs_kernel
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
 def test_variants_agree(kind):
     drawn = actions(kind, 3, 3, 2, seed=3)
-    runs = [configurations(Fleet(kind, 2, 3, variant=name), drawn) for name in fleet_kernel.variants()]
+    runs = [configurations(Fleet(PARAMETERS[kind], 2, 3, variant=name), drawn) for name in fleet_kernel.variants()]
     for run in runs[1:]:
         assert np.abs(run - runs[0]).max() < 1e-11
 
@@ -177,8 +186,8 @@ def test_variants_agree(kind):
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
 def test_diverged_robot_is_reported_and_the_others_are_unchanged(kind):
     drawn = actions(kind, 3, 10, 2, seed=4)
-    whole = configurations(Fleet(kind, 2, 10), drawn)
-    robots = Fleet(kind, 2, 10)
+    whole = configurations(Fleet(PARAMETERS[kind], 2, 10), drawn)
+    robots = Fleet(PARAMETERS[kind], 2, 10)
     before = configurations(robots, drawn[:1])
     robots._state[:, 5, 3, 3] = np.inf  # the velocity of one node of robot 3 and of those in its lane in other blocks
     diverged = np.arange(10) % robots.lanes == 3
@@ -195,7 +204,7 @@ def test_diverged_robot_is_reported_and_the_others_are_unchanged(kind):
 @needs_kernel
 def test_run_after_reset_is_the_same():
     drawn = actions("pneumatic", 3, 4, 2, seed=5)
-    robots = Fleet("pneumatic", 2, 4)
+    robots = Fleet(PNEUMATIC, 2, 4)
     first = configurations(robots, drawn)
     robots.reset()
     assert np.array_equal(configurations(robots, drawn), first)
@@ -205,7 +214,7 @@ def test_run_after_reset_is_the_same():
 @pytest.mark.parametrize("kind", ["cable", "pneumatic"])
 def test_run_continues_from_a_snapshot(kind):
     drawn = actions(kind, 4, 11, 2, seed=8)
-    robots = Fleet(kind, 2, 11)
+    robots = Fleet(PARAMETERS[kind], 2, 11)
     configurations(robots, drawn[:2])
     taken = robots.snapshot()
     went = configurations(robots, drawn[2:])
@@ -223,7 +232,7 @@ def test_run_continues_from_a_snapshot(kind):
 def test_exponential_damping_is_stable_where_explicit_damping_diverges():
     """Full-range first actions on twelve modules: PyElastica's explicit damping diverges too."""
     drawn = actions("cable", 1, 16, 12, seed=6)
-    explicit, exponential = Fleet("cable", 12, 16, damping="explicit"), Fleet("cable", 12, 16)
+    explicit, exponential = Fleet(CABLE, 12, 16, damping="explicit"), Fleet(CABLE, 12, 16)
     configurations(explicit, drawn)
     configurations(exponential, drawn)
     assert not explicit.alive.all()
@@ -232,7 +241,7 @@ def test_exponential_damping_is_stable_where_explicit_damping_diverges():
 
 @needs_kernel
 def test_curvature_beyond_the_range_of_the_series_is_a_divergence():
-    robots = Fleet("cable", 2, 2)
+    robots = Fleet(CABLE, 2, 2)
     angle = 0.6
     turned = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
     robots._state[0, 20, 6:15, 1] = np.ravel(turned)
@@ -242,7 +251,7 @@ def test_curvature_beyond_the_range_of_the_series_is_a_divergence():
 
 @needs_kernel
 def test_wrong_shapes_and_periods_are_refused():
-    robots = Fleet("cable", 2, 3)
+    robots = Fleet(CABLE, 2, 3)
     with pytest.raises(ValueError, match=r"expected \(3, 2, 2\)"):
         robots.step(np.zeros((3, 4, 2)))
     with pytest.raises(ValueError, match=r"found an actuation of 1\.5"):
@@ -252,7 +261,7 @@ def test_wrong_shapes_and_periods_are_refused():
     with pytest.raises(ValueError, match="whole number"):
         robots.step(np.zeros((3, 2, 2)), period_s=1.1e-4)
     with pytest.raises(ModsoftError, match="expected one of"):
-        Fleet("cable", 2, 3, variant="mmx")
+        Fleet(CABLE, 2, 3, variant="mmx")
 
 
 @needs_kernel
@@ -265,7 +274,7 @@ def test_environment_limits_the_variant(monkeypatch, limit):
     monkeypatch.setenv(fleet_kernel.LIMIT, limit)
     allowed = [name for name in runnable if fleet_kernel.VARIANTS.index(name) <= fleet_kernel.VARIANTS.index(limit)]
     assert fleet_kernel.variants() == allowed
-    assert Fleet("cable", 2, 1).lanes == fleet_kernel.library().fleet_lanes(fleet_kernel.VARIANTS.index(allowed[-1]))
+    assert Fleet(CABLE, 2, 1).lanes == fleet_kernel.library().fleet_lanes(fleet_kernel.VARIANTS.index(allowed[-1]))
 
 
 def test_limit_that_is_no_variant_is_refused_in_one_line(monkeypatch):
@@ -277,11 +286,11 @@ def test_limit_that_is_no_variant_is_refused_in_one_line(monkeypatch):
 
 def test_pyelastica_is_used_without_the_kernel(monkeypatch, capsys):
     monkeypatch.setattr(fleet_kernel, "library", lambda: None)
-    robots = fleet.simulated("pneumatic", 2, 3)
+    robots = fleet.simulated(robot_file.load("pneumatic-2"), 3)
     assert isinstance(robots, Arms)
     assert capsys.readouterr().err.count("\n") == 1
     with pytest.raises(ModsoftError, match="make install"):
-        Fleet("pneumatic", 2, 3)
+        Fleet(PNEUMATIC, 2, 3)
     drawn = actions("pneumatic", 2, 3, 2, seed=7)
     before = configurations(robots, drawn[:1])
     robots._arms[1]._rod.velocity_collection[0, 5] = np.inf
@@ -297,10 +306,55 @@ def test_pyelastica_is_used_without_the_kernel(monkeypatch, capsys):
 
 @pytest.mark.parametrize("kind", PARAMETERS)
 def test_opposite_cables_share_an_actuator_and_chambers_do_not(kind):
-    axes, places = fleet_kernel.places(PARAMETERS[kind])
-    assert len(axes) == 2
-    assert axes == ([0, 1] if kind == "cable" else [0, 0])
-    assert sorted(np.sign(places)) == ([1, 1] if kind == "cable" else [-1, 1])
+    layout = fleet_kernel.layout(PARAMETERS[kind])
+    assert (layout.second, layout.alternate) == ((1, True) if kind == "cable" else (0, False))
+    assert sorted(np.sign(layout.places)) == ([1, 1] if kind == "cable" else [-1, 1])
+
+
+def with_directions(kind, drive, directions_deg):
+    """Parameters of a preset with other actuators."""
+    parameters = PARAMETERS[kind]
+    directions = bending_directions("spatial", drive, directions_deg)
+    actuators = dataclasses.replace(parameters.actuators, angles_deg=directions_deg, directions=directions)
+    return dataclasses.replace(parameters, actuators=actuators)
+
+
+@needs_kernel
+@pytest.mark.parametrize(
+    ("kind", "drive", "directions_deg"),
+    [
+        ("pneumatic", "chambers", (0.0, 120.0, 240.0)),
+        ("pneumatic", "chambers", (10.0, 82.0, 154.0, 226.0, 298.0)),
+        ("cable", "cables", (45.0, 135.0, 225.0, 315.0)),  # without friction and lags
+        ("cable", "cables", (90.0, 210.0, 330.0)),
+    ],
+)
+def test_actuators_in_any_direction_are_as_in_pyelastica(kind, drive, directions_deg):
+    parameters, modules = with_directions(kind, drive, directions_deg), 2
+    drawn = 0.6 * np.random.default_rng(1).uniform(-1.0, 1.0, (2, 1, modules, 2))
+    expected = configurations(Arms(parameters, modules, 1), drawn)
+    for variant in fleet_kernel.variants():
+        simulated = configurations(Fleet(parameters, modules, 1, damping="explicit", variant=variant), drawn)
+        assert np.abs(simulated - expected).max() < 1e-9
+    bent = np.linalg.norm(expected[1:, :, :, :2], axis=-1)
+    assert bent.min() > 1e-4
+
+
+@needs_kernel
+def test_module_bends_in_the_direction_of_its_action():
+    """Three chambers: the action's direction is that of the bending, whichever chambers share it."""
+    angles = np.radians(np.arange(0.0, 360.0, 30.0))
+    towards = 0.5 * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    robots = Fleet(with_directions("pneumatic", "chambers", (0.0, 120.0, 240.0)), 2, len(angles))
+    run = configurations(robots, np.broadcast_to(towards[None, :, None], (3, len(angles), 2, 2)).copy())
+    reached = np.arctan2(run[-1, :, 1, 1], run[-1, :, 1, 0])
+    assert np.degrees(np.abs((reached - angles + np.pi) % (2 * np.pi) - np.pi)).max() < 6.0
+
+
+def test_more_actuators_than_the_kernel_has_are_refused():
+    many = tuple(25.0 * i for i in range(13))
+    with pytest.raises(ModsoftError, match="13 actuators a module, the fleet simulates up to 12"):
+        fleet_kernel.layout(with_directions("pneumatic", "chambers", many))
 
 
 @needs_kernel
@@ -332,7 +386,7 @@ def test_benchmark_measures_prints_and_draws(tmp_path):
 
 @pytest.mark.parametrize("count", [1, 20])
 def test_arrays_of_a_state_do_not_change_in_later_steps(count):
-    fleet = Fleet("cable", 2, count)
+    fleet = Fleet(CABLE, 2, count)
     read = {name: getattr(fleet, name) for name in ("positions", "directors", "configuration")}
     kept = {name: values.copy() for name, values in read.items()}
     fleet.step(np.full((count, 2, 2), 0.5))

@@ -1,12 +1,15 @@
 """The simulators of collection: they agree, and a killed collection resumes."""
 
+import dataclasses
 import subprocess
 import sys
 import time
 
 import benchmarks
+import msgspec
 import numpy as np
 import pytest
+from plants import PNEUMATIC
 
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import ModsoftError, RobotFileError, UsageError
@@ -14,6 +17,7 @@ from modsoft.training.data import collect, dataset
 from modsoft.training.data.actions import draw_actions
 from modsoft.training.simulation import elastica, fleet_kernel, simulators
 from modsoft.training.simulation.fleet import Fleet
+from modsoft.training.simulation.parameters import plant_of
 
 pytestmark = pytest.mark.instructions
 
@@ -110,18 +114,28 @@ def test_named_variant_gives_the_same_bits():
     np.testing.assert_allclose(plain, simulators.fastest(robot).simulate(robot, actions), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("section", "key", "value", "message"),
-    [
-        ("loop", "hz", 3.0, r"loop.hz 3.0 .* expected whole steps of"),
-        ("valve", "p_max_bar", 0.5, r"0.08, 0.5; expected 0.08, 0.35, the pressures of the simulated robot"),
-    ],
-)
-def test_unsuitable_robots_are_refused(section, key, value, message):
+def changed(section, key, value):
+    """pneumatic-3 with another value."""
     table = robot_file.load("pneumatic-3").to_dict()
     table[section] = {**table[section], key: value}
-    with pytest.raises(RobotFileError, match=message):
-        simulators.fastest(robot_file.from_dict(table))
+    return robot_file.from_dict(table)
+
+
+def test_period_that_is_no_whole_number_of_steps_is_refused():
+    with pytest.raises(RobotFileError, match=r"loop.hz 3.0 .* expected whole steps of"):
+        simulators.fastest(changed("loop", "hz", 3.0))
+
+
+def test_simulated_chambers_have_the_pressures_of_the_valves():
+    actuators = plant_of(changed("valve", "p_max_bar", 0.5)).actuators
+    assert (actuators.rest_stress_pa, actuators.full_stress_pa) == pytest.approx((-8e3, -50e3))
+
+
+def test_physical_parameters_of_the_robot_file_are_simulated():
+    longer = plant_of(changed("simulation", "module_length_m", 0.08))
+    assert longer == dataclasses.replace(PNEUMATIC, module_length_m=0.08)
+    with pytest.raises(RobotFileError, match=r"robot pneumatic-3 has no \[simulation\], expected one"):
+        plant_of(msgspec.structs.replace(robot_file.load("pneumatic-3"), simulation=None))
 
 
 def command(*arguments: str) -> list[str]:

@@ -46,7 +46,7 @@ def measured(name: str, robot_name: str, steps: int | None) -> list[dict[str, An
         "spatial": (configuration_errors_percent, "percent"),
     }[robot.motion]
     rows = []
-    rollouts = rollout(simulated(robot.preset, robot.modules, len(setups)), setups).robots()
+    rollouts = rollout(simulated(robot, len(setups)), setups).robots()
     for (task, each), setup, motion in zip(cases, setups, rollouts, strict=True):
         mean = errors_of(motion.configuration, setup.desired).mean(axis=0)
         row = {"model": name, "robot": robot_name, "task": task, "correction": each, "unit": unit}

@@ -43,7 +43,7 @@ def reach_deg(robot: Robot) -> Array:
     for module in range(robot.modules):
         actions[module, :, module] = alone
     flat = actions.reshape(-1, robot.modules, robot.action_size)
-    robots = simulated(robot.preset, robot.modules, len(flat))
+    robots = simulated(robot, len(flat))
     for _ in range(PERIODS):
         robots.step(flat, robot.loop.period_s)
     bent = np.degrees(np.arccos(np.clip(robots.configuration[..., 2], -1.0, 1.0)))

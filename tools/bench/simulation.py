@@ -25,13 +25,17 @@ import numpy as np
 import report
 from simulation_page import draw, section, section_with_figure
 
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.entry_point import entry
 from modsoft.runtime.errors import DeviceAbsent, ModsoftError, UsageError
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.elastica import Arm, _Loads, _Simulator
 from modsoft.training.simulation.fleet import Fleet
-from modsoft.training.simulation.parameters import PARAMETERS, PlantParameters
+from modsoft.training.simulation.parameters import PlantParameters, plant_of
 
+PARAMETERS = {
+    kind: plant_of(robot_file.load(robot)) for kind, robot in (("cable", "cable-4"), ("pneumatic", "pneumatic-3"))
+}
 OPERATIONS_PER_ELEMENT = {"cable": 417, "pneumatic": 435}
 ACTIONS = {"cable": 2, "pneumatic": 1}
 BLOCK = 8
@@ -48,7 +52,7 @@ class Block:
         self.parameters = PARAMETERS[kind]
         self.simulator = _Simulator()
         for each in actuation:
-            arm = Arm(kind, modules)
+            arm = Arm(PARAMETERS[kind], modules)
             arm.step(each, self.parameters.time_step_s)  # sets the stresses
             self.simulator.append(arm._rod)
             ends = {"constrained_position_idx": (0,), "constrained_director_idx": (0,)}
@@ -72,13 +76,13 @@ def turns(kind: str, modules: int, counts: list[int]) -> dict[str, tuple[int, Ca
     """What is timed for one kind and module number: name to (robots, a turn)."""
     turn_s = turn_steps(PARAMETERS[kind]) * PARAMETERS[kind].time_step_s
     actions = 0.5 * np.random.default_rng(modules).uniform(-1, 1, (max(*counts, BLOCK), modules, ACTIONS[kind]))
-    arm = Arm(kind, modules)
+    arm = Arm(PARAMETERS[kind], modules)
     by_name: dict[str, tuple[int, Call]] = {
         "elastica": (1, lambda: arm.step(actions[0], turn_s)),
         "elastica block of 8": (BLOCK, Block(kind, modules, actions[:BLOCK]).advance),
     }
     for count in counts:
-        fleet = Fleet(kind, modules, count)
+        fleet = Fleet(PARAMETERS[kind], modules, count)
         by_name[f"fleet of {count}"] = (count, lambda fleet=fleet, count=count: fleet.step(actions[:count], turn_s))
     return by_name
 
@@ -102,7 +106,7 @@ def two_threads(variant: int, rounds: int) -> dict[str, float]:
     library, rounds = fleet_kernel.library(), 10 * rounds
     turn_s, steps = 0.125, 500
     actions = 0.5 * np.random.default_rng(0).uniform(-1, 1, (32, 4, 2))
-    fleets = {threads: Fleet("cable", 4, 32, threads=threads) for threads in (1, 2)}
+    fleets = {threads: Fleet(PARAMETERS["cable"], 4, 32, threads=threads) for threads in (1, 2)}
     calls: dict[Any, Call] = {
         threads: lambda fleet=fleet: fleet.step(actions, turn_s) for threads, fleet in fleets.items()
     }
@@ -171,7 +175,7 @@ def compared(kinds: list[str], module_numbers: list[int], periods: int) -> list[
     for kind in kinds:
         for modules in module_numbers:
             actions = np.random.default_rng(2).uniform(-1, 1, (periods, 1, modules, ACTIONS[kind]))
-            arm, fleet = Arm(kind, modules), Fleet(kind, modules, 1, damping="explicit")
+            arm, fleet = Arm(PARAMETERS[kind], modules), Fleet(PARAMETERS[kind], modules, 1, damping="explicit")
             difference, done = np.abs(fleet.configuration[0] - arm.configuration).max(), 0
             for action in actions:
                 fleet.step(action)

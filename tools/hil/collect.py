@@ -50,8 +50,9 @@ def collect_on_rig(
         simulated = arm
         if simulated is None:
             from modsoft.training.simulation.elastica import Arm  # the simulator takes a second to import
+            from modsoft.training.simulation.parameters import plant_of
 
-            simulated = Arm(robot.preset, robot.modules)
+            simulated = Arm(plant_of(robot), robot.modules)
         with SteppedRig(robot, simulated, board, lambda now: Polaris(now, errors=errors)) as rig:
             devices = Devices(robot, rig.frames, rig.board, rig.clock, rig.wait, calibration)
             with devices.signals:

@@ -194,6 +194,7 @@ def duties_from(descriptor: int) -> Iterator[Array | None]:
 def cli(file_or_name: Path, pull_downs: bool) -> None:
     """The simulated pneumatic robot in real time (started by modsoft-hil)."""
     from modsoft.training.simulation.elastica import Arm  # the simulator takes a second to import
+    from modsoft.training.simulation.parameters import plant_of
 
     robot = load_robot(file_or_name)
 
@@ -201,7 +202,7 @@ def cli(file_or_name: Path, pull_downs: bool) -> None:
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
 
-    arm = Arm(robot.preset, robot.modules)
+    arm = Arm(plant_of(robot), robot.modules)
     warm = ValvesAndArm(robot, arm)
     warm.advance(np.zeros(0), SLICE_S)  # compiles
     arm.reset()

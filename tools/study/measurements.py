@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.features import angle_between_deg
 from modsoft.runtime.files import written
@@ -36,7 +37,7 @@ from modsoft.study.results import (
 from modsoft.study.rollouts import StoredRun
 from modsoft.training import checkpoint as checkpoints
 from modsoft.training.data import coverage
-from modsoft.training.simulation.parameters import CABLE
+from modsoft.training.simulation.parameters import plant_of
 from modsoft.training.simulation.rollout import configuration_errors_percent
 
 Fields = dict[str, Any]  # fields of a Record that several records share
@@ -124,7 +125,8 @@ def of_run(table: str, fields: Fields, stored: StoredRun, task: str) -> Iterator
 def tip_distance_percent(stored: StoredRun) -> Array:
     """Distance of the tip from the base's axis, % of the robot's length at rest, at every step (K + 1,)."""
     positions = stored.rollout.positions
-    return 100.0 * np.linalg.norm(positions[:, -1, :2], axis=-1) / (positions.shape[1] * CABLE.module_length_m)
+    length_m = plant_of(robot_file.load("cable-4")).module_length_m * positions.shape[1]
+    return 100.0 * np.linalg.norm(positions[:, -1, :2], axis=-1) / length_m
 
 
 def tip_tilt_deg(stored: StoredRun) -> Array:

@@ -6,6 +6,7 @@ import functools
 from functools import partial
 from typing import Any
 
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
 from modsoft.study import rollouts
 from modsoft.study.paths import Folder
@@ -47,13 +48,14 @@ def identity(plan: Plan, task: str, modules: int) -> dict[str, Any]:
 
 def _optimize(plan: Plan, folder: Folder, task_and_modules: tuple[str, int], add_progress: AddProgress) -> None:
     from modsoft.training.simulation.oracle import oracle_error
+    from modsoft.training.simulation.parameters import plant_of
 
     task, modules = task_and_modules
     desired = rollouts.desired_of(plan, task, modules)
-    actions, _ = oracle_error("cable", modules, desired, seed=0)
+    actions, _ = oracle_error(plant_of(robot_file.load(f"cable-{modules}")), modules, desired, seed=0)
     rollouts.store(folder.oracle_error(task, modules), identity(plan, task, modules), replay(modules, actions), desired)
 
 
 def replay(modules: int, actions: Array) -> Rollout:
     """The motion of a robot, at rest before, under actions (K, N, A)."""
-    return rollout(simulated("cable", modules, 1), actions[:, None]).robots()[0]
+    return rollout(simulated(robot_file.load(f"cable-{modules}"), 1), actions[:, None]).robots()[0]

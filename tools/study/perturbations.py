@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.arrays import Array
-from modsoft.training.simulation.parameters import CABLE
+from modsoft.training.simulation.parameters import plant_of
 from modsoft.training.simulation.rollout import Measure, exactly
 
 NOISE_DEG = 0.5  # of every tool's orientation about each of its axes, standard deviation
@@ -74,5 +75,5 @@ def robot_properties(perturbation: str, modules: int, seed: int) -> dict[str, An
         signs = np.random.default_rng([seed, 2]).choice([-1.0, 1.0], modules)
         return {"stiffness": tuple(1.0 + STIFFNESS_CHANGE * signs)}
     if perturbation == "payload":
-        return {"tip_payload_kg": CABLE.module_kg}
+        return {"tip_payload_kg": plant_of(robot_file.load("cable-4")).module_kg}
     return {}

@@ -118,7 +118,7 @@ def _rollout(plan: Plan, folder: Folder, batch: tuple[Run, ...], add_progress: A
         for run in batch
     ]
     properties = perturbations.robot_properties(first.perturbation, first.modules, first.model.seed)
-    simulator = simulated("cable", first.modules, len(batch), perturbation=Perturbation(**properties))
+    simulator = simulated(robot, len(batch), perturbation=Perturbation(**properties))
     sha256 = {model: stages.onnx_sha256(folder, model) for model in models}
     for run, setup, motion in zip(batch, setups, rollout(simulator, setups).robots(), strict=True):
         if not np.isfinite(motion.configuration).all():

@@ -30,7 +30,7 @@ from modsoft.training.data.backends import BACKENDS
 from modsoft.training.data.dataset import Episode
 from modsoft.training.data.episode_store import Shards, refuse_other
 from modsoft.training.simulation import simulators
-from modsoft.training.simulation.parameters import NOMINAL, PARAMETERS, Perturbation
+from modsoft.training.simulation.parameters import NOMINAL, Perturbation, plant_of
 from modsoft.training.simulation.simulators import Simulate, Simulator
 
 EPISODES_PER_ROBOT = 8  # of a varied data set: the lanes of the fleet
@@ -52,7 +52,7 @@ def perturbation_of(generation: dict[str, Any], robot: Robot, index: int) -> Per
     rng = np.random.default_rng(seed)
     stiffness = 1.0 + STIFFNESS_CHANGE * rng.uniform(-1.0, 1.0, robot.modules)
     payload_modules = rng.uniform(0.0, PAYLOAD_MODULES) if rng.uniform() < 0.7 else 0.0
-    return Perturbation(tuple(stiffness.tolist()), payload_modules * PARAMETERS[robot.preset].module_kg)
+    return Perturbation(tuple(stiffness.tolist()), payload_modules * plant_of(robot).module_kg)
 
 
 def episodes(generation: dict[str, Any], robot: Robot, indices: list[int], simulate: Simulate) -> list[Episode]:
@@ -97,7 +97,7 @@ def _of_one_robot(
 
 def generation_settings(robot: Robot, strategy: str, seed: int, steps: int, simulator: str) -> dict[str, Any]:
     """All that the numbers of an episode depend on, beside its index. simulator: its name."""
-    parameters = json.dumps(asdict(PARAMETERS[robot.preset]), sort_keys=True)
+    parameters = json.dumps(asdict(plant_of(robot)), sort_keys=True)
     settings = {
         "robot": robot.to_dict(),
         "strategy": strategy,

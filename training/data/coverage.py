@@ -24,7 +24,7 @@ from modsoft.runtime.robot import Robot
 from modsoft.training import plotting
 from modsoft.training.data import dataset
 from modsoft.training.data.workspace import CUBE, SQUARE
-from modsoft.training.simulation.parameters import PARAMETERS
+from modsoft.training.simulation.parameters import plant_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -101,7 +101,7 @@ def compare(paths: list[Path]) -> list[Coverage]:
 
 
 def _kind(robot: Robot) -> str:
-    return robot.name if robot.simulation is None else robot.preset
+    return (robot.simulation.preset if robot.simulation else None) or robot.name
 
 
 def _module_length_m(data: dataset.DataSet, path: Path) -> float:
@@ -113,7 +113,7 @@ def _module_length_m(data: dataset.DataSet, path: Path) -> float:
         raise ModelError(
             f"{path}: the length of a module is not known; give [simulation] in the robot file, and import it again"
         )
-    return PARAMETERS[data.robot.preset].module_length_m
+    return plant_of(data.robot).module_length_m
 
 
 def line(coverage: Coverage) -> str:

@@ -10,11 +10,11 @@ import elastica
 import numpy as np
 
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.control.actuation import activations
+from modsoft.runtime.control.actuation import module_actuators
 from modsoft.runtime.control.features import from_directors
 from modsoft.runtime.errors import ModsoftError
 from modsoft.training.simulation.loads import LoadConstants, Rod, add_loads, follow
-from modsoft.training.simulation.parameters import NOMINAL, PARAMETERS, PASCAL_PER_BAR, Perturbation, PlantParameters
+from modsoft.training.simulation.parameters import NOMINAL, PASCAL_PER_BAR, Perturbation, PlantParameters
 
 
 class _Simulator(elastica.BaseSystemCollection, elastica.Constraints, elastica.Forcing):
@@ -39,7 +39,7 @@ class _Loads(elastica.NoForces):
             actuators.offset_ratio * directions,
             np.full(len(angles), actuators.area_ratio * np.pi * parameters.radius_m**2),
             np.array(actuators.weight),
-            actuators.longest,
+            actuators.longest_ratio,
             np.array([parameters.friction_n_m2, parameters.friction_curvature_per_m]),
         )
         self._constants = tuple(constants)
@@ -56,19 +56,19 @@ class _Loads(elastica.NoForces):
 
 
 class Arm:
-    """A robot of `modules` modules of one kind (`cable` or `pneumatic`), starting at rest at activation 0.
+    """A robot of `modules` modules, starting at rest at activation 0.
 
-    kind: a key of `PARAMETERS`. Activation 0 of a pneumatic arm is its lower pressure, not a vented chamber. A wrong
-    shape, an actuation outside [-1, 1] or pressures on a cable robot raise ValueError.
+    Activation 0 of a pneumatic arm is its lower pressure, not a vented chamber. A wrong shape, an actuation outside
+    [-1, 1] or pressures on a cable robot raise ValueError.
 
-    A pneumatic arm is simulated as a rod in space too, with loads and start in the x-z plane. Its motion stays
-    exactly in the plane, because every force out of it is a sum of zeros.
+    A planar arm is simulated as a rod in space too, with loads and start in the x-z plane. Its motion stays exactly in
+    the plane, because every force out of it is a sum of zeros.
     """
 
-    def __init__(self, kind: str, modules: int, *, perturbation: Perturbation = NOMINAL) -> None:
-        self.kind = kind
+    def __init__(self, parameters: PlantParameters, modules: int, *, perturbation: Perturbation = NOMINAL) -> None:
         self.modules = modules
-        self.parameters, self._stiffness = PARAMETERS[kind].perturbed(modules, perturbation)
+        self.parameters, self._stiffness = parameters.perturbed(modules, perturbation)
+        self._actuators = module_actuators(parameters.actuators.directions)
         self._time_s = np.float64(0.0)
         self._remainder_s = 0.0
         self._build()
@@ -93,21 +93,21 @@ class Arm:
 
     @property
     def pressures(self) -> Array:
-        """Pressures in the chambers (N, 2), bar, sides + and -, after the lags of valve and chamber."""
+        """Pressures in the chambers (N, n), bar, after the lags of valve and chamber."""
         self._pneumatic_only()
         return self._state["stress_pa"] / -PASCAL_PER_BAR
 
     def set_pressures(self, bar: Array) -> None:
-        """Set-points of the chambers (N, 2), bar, sides + and -, until the next call."""
+        """Set-points of the chambers (N, n), bar, until the next call."""
         self._pneumatic_only()
-        self._state["set_pa"][:] = -PASCAL_PER_BAR * self._shaped(bar)
+        self._state["set_pa"][:] = -PASCAL_PER_BAR * self._shaped(bar, len(self.parameters.actuators.angles_deg))
 
     def step(self, actuation: Array, period_s: float | None = None) -> Array:
         """One control period (by default that of the parameters) of `actuation` (N, A); the configuration after it."""
-        actuation = self._shaped(actuation, channels_per_action=2)
+        actuation = self._shaped(actuation, len(self.parameters.actuators.directions[0]))
         if not (np.abs(actuation) <= 1.0).all():
             raise ValueError(f"found an actuation of {actuation[~(np.abs(actuation) <= 1.0)][0]}, expected [-1, 1]")
-        activation = activations(actuation)
+        activation = self._actuators.activations(actuation)
         actuators = self.parameters.actuators
         span = actuators.full_stress_pa - actuators.rest_stress_pa
         self._state["set_pa"][:] = actuators.rest_stress_pa + span * activation
@@ -127,7 +127,7 @@ class Arm:
             self._time_s = self._stepper.step(self._simulator, self._time_s, step_s)
         if not np.isfinite(self._rod.position_collection).all():
             raise ModsoftError(
-                f"the simulated {self.kind} robot of {self.modules} modules is no longer finite {self._time_s:.3f} s "
+                f"the simulated robot of {self.modules} modules is no longer finite {self._time_s:.3f} s "
                 "after its start; expected a bounded motion; take smaller steps of the actuation"
             )
 
@@ -185,13 +185,13 @@ class Arm:
         self._rest = [(array, array.copy()) for array in [*arrays, *self._state.values()]]
         self.reset()
 
-    def _shaped(self, values: Array, channels_per_action: int = 1) -> Array:
+    def _shaped(self, values: Array, of_module: int) -> Array:
         values = np.asarray(values, dtype=np.float64)
-        expected = (self.modules, len(self.parameters.actuators.angles_deg) // channels_per_action)
+        expected = (self.modules, of_module)
         if values.shape != expected:
-            raise ValueError(f"found shape {values.shape}, expected {expected} for this {self.kind} robot")
+            raise ValueError(f"found shape {values.shape}, expected {expected} for this robot")
         return values
 
     def _pneumatic_only(self) -> None:
         if self.parameters.actuators.full_stress_pa > 0.0:
-            raise ValueError(f"a {self.kind} robot has no chambers")
+            raise ValueError("a cable robot has no chambers")

@@ -7,12 +7,15 @@
 #include <immintrin.h>
 #endif
 
-enum { ACTUATORS = 2 }; /* that act on a module at a time */
+/* Actuators that act on a module at a time: two along the directors, or as many as `struct plant` says, anywhere around
+ * the section. */
+enum { ACTUATORS = 2, ANYWHERE = 2, MOST_ACTUATORS = 12 };
 
-/* One kind of robot; the three arrays hold the differences between its elements. fleet.py fills it in, field by field.
+/* The modules of a robot; three arrays hold the differences between its elements. fleet.py fills it in, field by field.
  * Units: the rest length of an element, the time step, and newton; so a velocity is in rest lengths a time step. */
 struct plant {
-  int64_t second;        /* 0 or 1: the director that the second actuator is along; the first is along 0 */
+  int64_t second;        /* 0 or 1: the director that the second actuator is along; the first is along 0; or ANYWHERE */
+  int64_t actuators;     /* of a module, where they are ANYWHERE */
   int64_t lags;          /* whether the actuators follow their goal late */
   double tiny;           /* added to the length of an element, as PyElastica does */
   double shear, stretch; /* stiffness of a section */
@@ -28,8 +31,9 @@ struct plant {
   double turn_kick[2];                 /* angular velocity of a unit torque, likewise */
   double fade_kick[2];                 /* damping of the rotation at rest length, likewise */
   const double *mobility;              /* (elements + 1): velocity that a unit force gives a node in a time step */
-  const double *stiffness;             /* (elements): of shear and stretch, over that of the kind */
+  const double *stiffness;             /* (elements): of shear and stretch, over that of the robot */
   const double *rigidity;              /* (elements - 1): of bend and twist in a Voronoi domain, likewise */
+  const double *places;                /* (actuators, 2): along both directors, halves at rest, where ANYWHERE */
 };
 
 /* Elements a stage stays behind the first one, so that the stages of one turn of the loop do not wait for each other

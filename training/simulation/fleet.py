@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.control.actuation import activations
+from modsoft.runtime.control.actuation import module_actuators
 from modsoft.runtime.control.features import from_directors
 from modsoft.runtime.errors import ModsoftError
+from modsoft.runtime.robot import Robot
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.fleet_kernel import Damping
-from modsoft.training.simulation.parameters import NOMINAL, PARAMETERS, Perturbation
+from modsoft.training.simulation.parameters import NOMINAL, Perturbation, PlantParameters, plant_of
 
 # Layout of one element in memory, in vectors: `struct element` and `struct drive` of fleet_kernel.h.
 _ELEMENT = 20
@@ -47,7 +48,7 @@ class Snapshot(NamedTuple):
 
 
 class Fleet:
-    """`count` robots of one kind and one module number, starting at rest at activation 0.
+    """`count` robots with the same modules and module number, starting at rest at activation 0.
 
     damping: integration of the rotational damping. `explicit` is that of the recorded runs and of PyElastica; with the
     cable robot's time step of 2.5e-4 s it is only just stable, and some long robots diverge at a first large action.
@@ -61,7 +62,7 @@ class Fleet:
 
     def __init__(
         self,
-        kind: str,
+        parameters: PlantParameters,
         modules: int,
         count: int,
         damping: Damping = "exponential",
@@ -80,10 +81,11 @@ class Fleet:
         self._variant = fleet_kernel.VARIANTS.index(name)
         self._library = library
         self.lanes: int = library.fleet_lanes(self._variant)
-        self.kind, self.modules, self.count, self.damping = kind, modules, count, damping
-        self.parameters, self._stiffness = PARAMETERS[kind].perturbed(modules, perturbation)
+        self.modules, self.count, self.damping = modules, count, damping
+        self.parameters, self._stiffness = parameters.perturbed(modules, perturbation)
+        self._actuators = module_actuators(parameters.actuators.directions)
         self.time_step_s = self.parameters.time_step_s if time_step_s is None else time_step_s
-        self._alternate = fleet_kernel.alternate(self.parameters)
+        self._layout = fleet_kernel.layout(self.parameters)
         elements = modules * self.parameters.elements
         area = math.pi * self.parameters.radius_m**2
         mass = np.full(
@@ -95,9 +97,8 @@ class Fleet:
         mass[-1] += self.parameters.tip_mass_kg - self.parameters.connector_mass_kg
         # The kernel's units: the rest length of an element, the time step, newton.
         self._rest_length_m = self.parameters.module_length_m / self.parameters.elements
-        self._places = (
-            0.5 * self.parameters.radius_m / self._rest_length_m * np.array(fleet_kernel.places(self.parameters)[1])
-        )
+        half_radius = 0.5 * self.parameters.radius_m / self._rest_length_m
+        self._places = half_radius * np.array(self._layout.places)
         self._mobility = self.time_step_s**2 / self._rest_length_m / mass
         self._rigidity = self.parameters.bend_ratios(self._stiffness)
         self._constants = self._with_arrays(damping)
@@ -153,7 +154,7 @@ class Fleet:
     def step(self, actuation: Array, period_s: float | None = None) -> None:
         """One control period (by default that of the parameters) with `actuation` (B, N, A) in [-1, 1]."""
         actuation = np.asarray(actuation, dtype=np.float64)
-        expected = (self.count, self.modules, len(self.parameters.actuators.angles_deg) // 2)
+        expected = (self.count, self.modules, len(self.parameters.actuators.directions[0]))
         if actuation.shape != expected:
             raise ValueError(f"found actuation of shape {actuation.shape}, expected {expected} for this fleet")
         if not (np.abs(actuation) <= 1.0).all():
@@ -168,15 +169,18 @@ class Fleet:
         parameters.mobility = self._mobility.ctypes.data
         parameters.stiffness = self._stiffness.ctypes.data
         parameters.rigidity = self._rigidity.ctypes.data
+        parameters.places = self._places.ctypes.data
         return parameters
 
     def _set(self, drive: Array, actuation: Array) -> None:
         """Writes the forces of an actuation (eq. 3) and the positions of the actuators into the lanes of `drive`."""
         actuators = self.parameters.actuators
         span = actuators.full_stress_pa - actuators.rest_stress_pa
-        force = self._section_m2 * (actuators.rest_stress_pa + span * activations(actuation))
-        places = np.broadcast_to(self._places, (*actuation.shape[:2], len(self._places)))
-        if self._alternate:
+        force = self._section_m2 * (actuators.rest_stress_pa + span * self._actuators.activations(actuation))
+        # Of actuators anywhere around the section the kernel reads the places from its parameters.
+        along = self._places if self._layout.second is not None else np.zeros(len(self._places))
+        places = np.broadcast_to(along, (*actuation.shape[:2], len(along)))
+        if self._layout.alternate:
             force = force[..., ::2] + force[..., 1::2]  # one of them is zero
             places = np.where(actuation < 0.0, -places, places)
         for row, values in ((_GOAL if self._constants.lags else _FORCE, force), (_PLACE, places)):
@@ -215,7 +219,7 @@ class Fleet:
         drive = _aligned((1, self.modules, len(self._places), 4, self.lanes))
         state[0, :, 2] = np.arange(elements + 1.0)[:, None]
         state[0, :, _DIRECTOR] = np.eye(3).reshape(9, 1)
-        self._set(drive, np.zeros((self.lanes, self.modules, len(self.parameters.actuators.angles_deg) // 2)))
+        self._set(drive, np.zeros((self.lanes, self.modules, len(self.parameters.actuators.directions[0]))))
         if self._constants.lags:
             drive[:, :, :, _VALVE] = drive[:, :, :, _FORCE] = drive[:, :, :, _GOAL]
         # A robot that hangs straight does not rotate, so that the damping of rotation has no effect; but with explicit
@@ -232,11 +236,13 @@ class Arms:
 
     damping: Damping = "explicit"
 
-    def __init__(self, kind: str, modules: int, count: int, *, perturbation: Perturbation = NOMINAL) -> None:
+    def __init__(
+        self, parameters: PlantParameters, modules: int, count: int, *, perturbation: Perturbation = NOMINAL
+    ) -> None:
         from modsoft.training.simulation.elastica import Arm  # takes seconds to import
 
-        self.kind, self.modules, self.count = kind, modules, count
-        self._arms = [Arm(kind, modules, perturbation=perturbation) for _ in range(count)]
+        self.modules, self.count = modules, count
+        self._arms = [Arm(parameters, modules, perturbation=perturbation) for _ in range(count)]
         self.alive = np.ones(count, dtype=bool)
 
     @property
@@ -266,14 +272,15 @@ class Arms:
 
 
 def simulated(
-    kind: str, modules: int, count: int, damping: Damping = "exponential", *, perturbation: Perturbation = NOMINAL
+    robot: Robot, count: int, damping: Damping = "exponential", *, perturbation: Perturbation = NOMINAL
 ) -> Fleet | Arms:
     """`count` robots at rest in the fastest simulation of this installation. Without the compiled kernel that is
-    PyElastica, with one line on standard error."""
+    PyElastica, with one line on standard error. `RobotFileError` for a robot without [simulation]."""
+    parameters = plant_of(robot)
     if fleet_kernel.library() is not None:
-        return Fleet(kind, modules, count, damping, perturbation=perturbation)
+        return Fleet(parameters, robot.modules, count, damping, perturbation=perturbation)
     print(
         "the fast simulator is not built (no C compiler at installation?): PyElastica simulates, slower",
         file=sys.stderr,
     )
-    return Arms(kind, modules, count, perturbation=perturbation)
+    return Arms(parameters, robot.modules, count, perturbation=perturbation)

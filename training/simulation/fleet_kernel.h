@@ -39,13 +39,15 @@ struct NAME(work) {
 struct NAME(passed) {
   V d[3], v[3];    /* from A1 to A2: between the nodes, and the sum of their velocities */
   V z[3], inverse; /* from B1 to B2: twice the axis of the rotation times its sine; over the mean length */
-  V pull[ACTUATORS][3], share[ACTUATORS]; /* from C1 to C2: an actuator's stretched line; its force over that */
+  V pull[MOST_ACTUATORS][3],
+      share[MOST_ACTUATORS]; /* from C1 to C2: an actuator's stretched line; its force over that */
 };
 
 #define ELEMENT struct NAME(element)
 #define WORK struct NAME(work)
 #define DRIVE struct NAME(drive)
 #define PASSED struct NAME(passed)
+#define COUNT(p, second) ((second) == ANYWHERE ? (int)(p)->actuators : ACTUATORS)
 
 INLINE V NAME(root)(V x) {
 #if LANES == 8
@@ -153,19 +155,26 @@ INLINE void NAME(curvature)(const struct plant *p, double rigidity, const WORK *
   o->slope = (o->radius - oa->radius) * inverse;
 }
 
-/* C1: the force of each actuator of an element. The second one is along axis `second`. */
+/* C1: the force of each actuator of an element. The second one is along axis `second`, or all are anywhere. */
 INLINE void NAME(pulls)(const struct plant *p, int second, const DRIVE *drive, const WORK *o, const WORK *after,
                         PASSED *between) {
   V curl[3], slope = o->slope + after->slope;
   for (int i = 0; i < 3; i++) {
     curl[i] = o->curl[i] + after->curl[i];
   }
-  for (int a = 0; a < ACTUATORS; a++) {
+  for (int a = 0; a < COUNT(p, second); a++) {
     int axis = a == 1 ? second : 0;
     V x = drive[a].place, *t = between->pull[a];
-    t[axis] = o->strain[axis] + slope * x;
-    t[1 - axis] = axis ? o->strain[0] - curl[2] * x : o->strain[1] + curl[2] * x;
-    t[2] = axis ? o->strain[2] + curl[0] * x : o->strain[2] - curl[1] * x;
+    if (second == ANYWHERE) {
+      double px = p->places[2 * a], py = p->places[2 * a + 1];
+      t[0] = o->strain[0] + (slope * px - curl[2] * py);
+      t[1] = o->strain[1] + (slope * py + curl[2] * px);
+      t[2] = o->strain[2] + (curl[0] * py - curl[1] * px);
+    } else {
+      t[axis] = o->strain[axis] + slope * x;
+      t[1 - axis] = axis ? o->strain[0] - curl[2] * x : o->strain[1] + curl[2] * x;
+      t[2] = axis ? o->strain[2] + curl[0] * x : o->strain[2] - curl[1] * x;
+    }
     V local = NAME(root)(DOT(t, t));
     V weight = (p->weight[1] + local * (p->weight[2] + local * p->weight[3])) + p->weight[0] / local;
     M slack = (M)(weight < 0.0) | (M)(local > p->longest); /* weight: over local, which is positive */
@@ -196,13 +205,19 @@ INLINE void NAME(forces)(const struct plant *p, int rubs, int second, const DRIV
   for (int i = 0; i < 3; i++) {
     n[i] = o->stress[i];
   }
-  for (int a = 0; a < ACTUATORS; a++) {
+  for (int a = 0; a < COUNT(p, second); a++) {
     V y = o->radius * drive[a].place, t[3];
     for (int i = 0; i < 3; i++) {
       t[i] = between->pull[a][i] * between->share[a];
       n[i] += t[i];
     }
-    if (a == 1 && second) {
+    if (second == ANYWHERE) {
+      V x = o->radius * p->places[2 * a];
+      y = o->radius * p->places[2 * a + 1];
+      pair[0] += y * t[2];
+      pair[1] -= x * t[2];
+      pair[2] += x * t[1] - y * t[0];
+    } else if (a == 1 && second) {
       pair[0] += y * t[2];
       pair[2] -= y * t[0];
     } else {
@@ -320,7 +335,7 @@ INLINE void NAME(sweep)(const struct plant *p, int rubs, int second, int element
   *AT(0) = *AT(-1) = (WORK){0};  /* nothing bends before the first element */
   for (int k = 0; k < elements + LAG_D; k++) {
     if (left-- == 0) {
-      front.drive += ACTUATORS;
+      front.drive += COUNT(p, second);
       left = per_module - 1;
     }
     if (k > LAG_D && k < elements) {
@@ -360,16 +375,19 @@ static void NAME(advance)(const struct plant *p, int block, int modules, int per
                           long steps) {
   int elements = modules * per_module;
   ELEMENT *e = (ELEMENT *)state + (long)block * (elements + 1);
-  DRIVE *drive = (DRIVE *)drives + (long)block * modules * ACTUATORS;
+  int count = modules * COUNT(p, p->second);
+  DRIVE *drive = (DRIVE *)drives + (long)block * count;
   if (steps <= 0) {
     return;
   }
   NAME(drift)(elements, e, -0.5); /* every sweep drifts by a whole time step, the first one by half */
   for (long s = 0; s < steps; s++) {
     if (p->lags) {
-      NAME(follow)(p, modules * ACTUATORS, drive);
+      NAME(follow)(p, count, drive);
     }
-    if (p->friction > 0.0 && p->second) {
+    if (p->second == ANYWHERE) { /* without friction the same sweep adds zeros */
+      NAME(sweep)(p, 1, ANYWHERE, elements, per_module, drive, e);
+    } else if (p->friction > 0.0 && p->second) {
       NAME(sweep)(p, 1, 1, elements, per_module, drive, e);
     } else if (p->friction > 0.0) {
       NAME(sweep)(p, 1, 0, elements, per_module, drive, e);
@@ -407,3 +425,4 @@ static double NAME(peak)(long rounds) {
 #undef WORK
 #undef DRIVE
 #undef PASSED
+#undef COUNT

@@ -7,15 +7,17 @@ import functools
 import importlib.util
 import math
 import os
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.errors import ModsoftError, UsageError
 from modsoft.training.simulation.parameters import PlantParameters
 
 Damping = Literal["exponential", "explicit"]
 
+ANYWHERE, MOST_ACTUATORS = 2, 12  # as in fleet.c
 VARIANTS = ("plain", "avx2", "avx512")  # by the instructions they need
 LIMIT = "MODSOFT_KERNEL"  # environment variable: the highest variant to use; unset or empty: no limit
 
@@ -25,6 +27,7 @@ class PlantStruct(ctypes.Structure):
 
     _fields_ = (
         ("second", ctypes.c_int64),
+        ("actuators", ctypes.c_int64),
         ("lags", ctypes.c_int64),
         ("tiny", ctypes.c_double),
         ("shear", ctypes.c_double),
@@ -45,6 +48,7 @@ class PlantStruct(ctypes.Structure):
         ("mobility", ctypes.c_void_p),
         ("stiffness", ctypes.c_void_p),
         ("rigidity", ctypes.c_void_p),
+        ("places", ctypes.c_void_p),
     )
 
 
@@ -80,7 +84,7 @@ def variants() -> list[str]:
 
 
 def constants(parameters: PlantParameters, damping: Damping, time_step_s: float) -> PlantStruct:
-    """The parameters in the kernel's units, without the three arrays.
+    """The parameters in the kernel's units, without the four arrays.
 
     Those of the rod are PyElastica's: a disk's second moments, 27/28 for the shear of a section, a third of Young's
     modulus for shear.
@@ -99,13 +103,14 @@ def constants(parameters: PlantParameters, damping: Damping, time_step_s: float)
         kick = [-math.expm1(-rate * time_step_s) / rate if rate else time_step_s for rate in rates]
     velocity = length / time_step_s  # its unit, m/s
     actuators = parameters.actuators
-    axes, _ = places(parameters)
+    second = layout(parameters).second
     lags = (actuators.valve_lag_s, actuators.chamber_lag_s)
     shares = [1.0 - math.exp(-time_step_s / lag) if lag else 1.0 for lag in lags]
     if len(actuators.weight) > 4:
         raise ModsoftError(f"an actuator's weight has {len(actuators.weight)} coefficients, expected at most 4")
     return PlantStruct(
-        second=axes[1],
+        second=ANYWHERE if second is None else second,
+        actuators=len(actuators.angles_deg),
         lags=any(lags),
         tiny=1e-14 / length,
         shear=27 / 28 * shear * area,
@@ -114,7 +119,7 @@ def constants(parameters: PlantParameters, damping: Damping, time_step_s: float)
         half_damping=-0.5 * parameters.damping_n_s_m2 * length * (0.5 * velocity),
         drag=tuple(0.5 * each * (0.5 * velocity) ** 2 for each in (parameters.drag_transverse, parameters.drag_axial)),
         weight=(*actuators.weight, 0.0, 0.0, 0.0)[:4],
-        longest=actuators.longest,
+        longest=actuators.longest_ratio,
         valve_share=shares[0],
         chamber_share=shares[1],
         friction=2 * parameters.friction_n_m2 / length**2,
@@ -128,26 +133,27 @@ def constants(parameters: PlantParameters, damping: Damping, time_step_s: float)
     )
 
 
-def places(parameters: PlantParameters) -> tuple[list[int], list[float]]:
-    """Axis (0 or 1) and position (radii along it) of the actuators that can act at a time.
+class Layout(NamedTuple):
+    """Which actuators the kernel has at a time, and where."""
 
-    Of two opposite cables only one pulls, so that the pair is one actuator that changes sides: position of the first.
-    """
+    second: int | None  # director, 0 or 1, of the second of two actuators, the first is along 0; None: anywhere
+    alternate: bool  # an actuator is one of two opposite cables, of which only one pulls: it changes sides
+    places: list[float] | Array  # in radii: along the directors of two actuators, or (n, 2) of those anywhere
+
+
+def layout(parameters: PlantParameters) -> Layout:
+    """The layout of the actuators for the kernel: a fast one for opposite cables along both directors, and for chambers
+    along the first one; `ModsoftError` for more than `MOST_ACTUATORS`."""
     actuators = parameters.actuators
-    degrees = np.array(actuators.angles_deg) % 360.0
-    if not np.isin(degrees, (0.0, 90.0, 180.0, 270.0)).all():
-        raise ModsoftError(f"actuators at {actuators.angles_deg} degrees; expected 0, 90, 180 or 270")
-    if alternate(parameters):
-        degrees = degrees[::2]
-    axes = [int(each) for each in degrees // 90.0 % 2]
-    if axes not in ([0, 0], [0, 1]):
-        raise ModsoftError(f"actuators that act at a time along axes {axes}, expected [0, 0] or [0, 1]")
-    signs = np.where(degrees < 180.0, 1.0, -1.0)
-    return axes, [float(each) for each in actuators.offset_ratio * signs]
-
-
-def alternate(parameters: PlantParameters) -> bool:
-    """Whether of each two successive channels only one is under stress at a time, and they are on opposite sides."""
-    actuators = parameters.actuators
-    apart = np.diff(np.array(actuators.angles_deg).reshape(-1, 2), axis=-1) % 360.0
-    return actuators.rest_stress_pa == 0 and actuators.valve_lag_s == 0 and bool((apart == 180.0).all())
+    degrees = tuple(each % 360.0 for each in actuators.angles_deg)
+    offset = actuators.offset_ratio
+    signs = [1.0 if each < 180.0 else -1.0 for each in degrees]
+    without_bias = actuators.rest_stress_pa == 0 and actuators.valve_lag_s == actuators.chamber_lag_s == 0
+    if without_bias and degrees in ((0.0, 180.0, 90.0, 270.0), (180.0, 0.0, 270.0, 90.0)):
+        return Layout(1, True, [offset * sign for sign in signs[::2]])
+    if sorted(degrees) == [0.0, 180.0]:
+        return Layout(0, False, [offset * sign for sign in signs])
+    if len(degrees) > MOST_ACTUATORS:
+        raise ModsoftError(f"{len(degrees)} actuators a module, the fleet simulates up to {MOST_ACTUATORS}")
+    angles = np.radians(degrees)
+    return Layout(None, False, np.round(np.stack([np.cos(angles), np.sin(angles)], axis=-1), 15) * offset)

@@ -19,8 +19,8 @@ from scipy.sparse.linalg import spsolve
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.control.tasks import next_reference
 from modsoft.runtime.errors import ModsoftError
-from modsoft.runtime.layout import MOTIONS, PRESETS
 from modsoft.training.simulation.fleet import Fleet, Snapshot
+from modsoft.training.simulation.parameters import PlantParameters
 from modsoft.training.simulation.rollout import configuration_errors_percent, rollout
 
 PROBE = 1e-4  # of actuation, for finite differences
@@ -45,21 +45,21 @@ class _Candidate(NamedTuple):
     robot: Snapshot  # after it
 
 
-def oracle_error(kind: str, modules: int, desired: Array, *, seed: int = 0) -> OracleResult:
+def oracle_error(plant: PlantParameters, modules: int, desired: Array, *, seed: int = 0) -> OracleResult:
     """The best actions found for `desired` (K, N, 3), the configurations at the start of each period, from rest.
 
     seed: of the random starts of Gauss-Newton. Raises `ModsoftError` where the robot diverges under every action.
     """
-    actions = improved(kind, modules, desired, greedy(kind, modules, desired, seed=seed))
-    reached = rollout(Fleet(kind, modules, 1), actions[:, None]).configuration[:, 0]
+    actions = improved(plant, modules, desired, greedy(plant, modules, desired, seed=seed))
+    reached = rollout(Fleet(plant, modules, 1), actions[:, None]).configuration[:, 0]
     return OracleResult(actions, configuration_errors_percent(reached, desired))
 
 
-def greedy(kind: str, modules: int, desired: Array, *, seed: int = 0) -> Array:
+def greedy(plant: PlantParameters, modules: int, desired: Array, *, seed: int = 0) -> Array:
     """Actions (K, N, A), each the best for the end of its own period, without regard to later ones."""
-    lanes, size = Fleet(kind, modules, 1).lanes, modules * len(MOTIONS[PRESETS[kind][0]].action)
+    lanes, size = Fleet(plant, modules, 1).lanes, modules * len(plant.actuators.directions[0])
     # The robot, one for each finite difference, and random starts to fill the last block, which take no extra time.
-    robots = Fleet(kind, modules, -(-(size + 3) // lanes) * lanes)
+    robots = Fleet(plant, modules, -(-(size + 3) // lanes) * lanes)
     random = np.random.default_rng(seed)
     robot, guess = robots.snapshot([0]), np.zeros(size)
     actions: list[Array] = []
@@ -112,15 +112,15 @@ def _weights(errors: Array) -> Array:
     return np.repeat(1.0 / np.maximum(errors.ravel(), 1e-3), 3)
 
 
-def improved(kind: str, modules: int, desired: Array, actions: Array, *, sweeps: int = SWEEPS) -> Array:
+def improved(plant: PlantParameters, modules: int, desired: Array, actions: Array, *, sweeps: int = SWEEPS) -> Array:
     """`actions` (K, N, A) after at most `sweeps` steps towards the smallest sum of all errors."""
     targets = next_reference(desired)
-    robots = Fleet(kind, modules, Fleet(kind, modules, 1).lanes)
-    error, taken, configuration = _traced(kind, modules, actions, targets)
+    robots = Fleet(plant, modules, Fleet(plant, modules, 1).lanes)
+    error, taken, configuration = _traced(plant, modules, actions, targets)
     for _ in range(sweeps):
         if error < TOLERANCE * desired[..., 0].size:
             break
-        slopes = _slopes(kind, modules, actions, taken, configuration)
+        slopes = _slopes(plant, modules, actions, taken, configuration)
         off = configuration - targets
         weights = _weights(np.linalg.norm(off, axis=-1))
         weights[-3 * modules :] = 0.0  # the last period's error is not counted
@@ -136,14 +136,14 @@ def improved(kind: str, modules: int, desired: Array, actions: Array, *, sweeps:
         if not sums[best] < (1.0 - LEAST_GAIN_OF_SWEEP) * error:
             break
         actions = trials[:, best]
-        error, taken, configuration = _traced(kind, modules, actions, targets)
+        error, taken, configuration = _traced(plant, modules, actions, targets)
     return actions
 
 
-def _traced(kind: str, modules: int, actions: Array, targets: Array) -> tuple[float, Snapshot, Array]:
+def _traced(plant: PlantParameters, modules: int, actions: Array, targets: Array) -> tuple[float, Snapshot, Array]:
     """Sum of the errors at the starts of the periods; the states before each action, as a snapshot of K robots; the
     configurations (K, N, 3) after each action."""
-    robot = Fleet(kind, modules, 1)
+    robot = Fleet(plant, modules, 1)
     taken, configuration = [], []
     for action in actions:
         taken.append(robot.snapshot())
@@ -154,11 +154,13 @@ def _traced(kind: str, modules: int, actions: Array, targets: Array) -> tuple[fl
     return error, Snapshot(*(np.concatenate(parts) for parts in zip(*taken, strict=True))), after
 
 
-def _slopes(kind: str, modules: int, actions: Array, taken: Snapshot, configuration: Array) -> sparse.csr_array:
+def _slopes(
+    plant: PlantParameters, modules: int, actions: Array, taken: Snapshot, configuration: Array
+) -> sparse.csr_array:
     """Derivatives (K * N * 3, K * N * A) of the configurations after each period by all actions."""
     flat = actions.reshape(len(actions), -1)
     periods, size = flat.shape
-    robots = Fleet(kind, modules, 8 * Fleet(kind, modules, 1).lanes)
+    robots = Fleet(plant, modules, 8 * Fleet(plant, modules, 1).lanes)
     rows, columns, values = [], [], []
     for start in range(0, flat.size, robots.count):
         moved = np.minimum(np.arange(start, start + robots.count), flat.size - 1)

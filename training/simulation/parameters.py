@@ -1,4 +1,4 @@
-"""Physical parameters of the two kinds of simulated robots.
+"""Physical parameters of a simulated robot, from its robot file.
 
 All modules of a robot have the same parameters, so that they hold for any number of modules. Quantities are those of
 one module or of the rod's cross-section; the arm is one straight rod along +z, clamped at the origin, first director
@@ -12,19 +12,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
-from msgspec.structs import fields
 
 from modsoft.runtime.arrays import Array
-from modsoft.runtime.robot import Valve
+from modsoft.runtime.robot import Robot
 
 PASCAL_PER_BAR = 1e5
-# Chamber pressures at activation 0 and 1: the defaults of the robot file.
-P_MIN_BAR, P_MAX_BAR = (each.default for each in fields(Valve) if each.name in ("p_min_bar", "p_max_bar"))
 
 
 class Perturbation(NamedTuple):
-    """How a robot differs from its kind's parameters."""
+    """How a robot differs from its parameters."""
 
     stiffness: Sequence[float] | None = None  # a factor for each module, on bending, twist, shear and stretch; None: 1
     tip_payload_kg: float = 0.0  # a point mass at the last node, which has weight too
@@ -40,23 +38,24 @@ class Actuators:
     At activation u an actuator carries the stress (1 - u) `rest_stress_pa` + u `full_stress_pa` (positive pulls,
     a cable; negative pushes, a chamber), and the force along its own tangent is stress * w(x) * area, with x its local
     length over its rest length, area its cross-section at rest over the rod's dilatation, and w the polynomial
-    `weight` (ascending powers), zero where negative and beyond `longest`.
+    `weight` (ascending powers), zero where negative and beyond `longest_ratio`.
     """
 
     angles_deg: tuple[float, ...]  # around the section, from the first director towards the second
+    directions: tuple[tuple[float, ...], ...]  # unit directions in which they bend the module, [a_0] or [a_0, a_1]
     offset_ratio: float  # distance from the centre line over the rod's current radius
     area_ratio: float  # cross-section at rest over the rod's
     rest_stress_pa: float
     full_stress_pa: float
     weight: tuple[float, ...]
-    longest: float = 2.0  # x beyond which the actuator is slack
+    longest_ratio: float = 2.0  # x beyond which the actuator is slack
     valve_lag_s: float = 0.0  # first-order time constants of the stress: set-point to valve, valve to chamber
     chamber_lag_s: float = 0.0
 
 
 @dataclass(frozen=True)
 class PlantParameters:
-    """One kind of robot."""
+    """The modules of one robot."""
 
     module_length_m: float
     elements: int  # of one module
@@ -88,7 +87,7 @@ class PlantParameters:
         return self.density_kg_m3 * np.pi * self.radius_m**2 * self.module_length_m
 
     def perturbed(self, modules: int, perturbation: Perturbation) -> tuple[PlantParameters, Array]:
-        """The parameters with the payload, and the stiffness of the elements (modules * elements,) over the kind's own.
+        """The parameters with the payload, and the stiffness of the elements (modules * elements,) over its own.
 
         Raises `ValueError` for factors that are not one positive number a module, and for a negative payload.
         """
@@ -126,70 +125,25 @@ class PlantParameters:
         return [round(each / self.time_step_s) * self.time_step_s for each in slices]
 
 
-# The robot of the paper's simulations, exactly (section 2; from the authors' published runs). The drag is that of
-# water. The explicit rotational damping is only just stable: full-range jumps of long robots can diverge.
-CABLE = PlantParameters(
-    module_length_m=0.05,
-    elements=25,
-    radius_m=0.01,
-    density_kg_m3=1050.0,
-    youngs_modulus_pa=10e3,
-    gravity_m_s2=0.5,
-    damping_n_s_m2=0.05,
-    torque_damping_n_s=0.05,
-    actuators=Actuators(
-        angles_deg=(0.0, 180.0, 90.0, 270.0),
-        offset_ratio=0.75,
-        area_ratio=0.09,
-        rest_stress_pa=0.0,
-        full_stress_pa=10e3,
-        weight=(-6.44, 18.01, -13.64, 3.06),
-    ),
-    time_step_s=2.5e-4,
-    period_s=1.0,
-    drag_transverse=0.41,
-    drag_axial=0.033,
-)
-
-# A robot like that of section 3.1: two opposite chambers a module between stiff connectors, hanging from a stick. The
-# paper gives pressures and reach, not the modules; these are chosen so that three modules reach 5.9, 36 and 90
-# degrees, base first, and the tasks stay within the pressures. Density and modulus are those of a hollow section of
-# soft silicone; the connectors' inertia is spread over the module. Linear damping represents the losses in the wall.
-PNEUMATIC = PlantParameters(
-    module_length_m=0.054,
-    elements=6,
-    radius_m=0.015,
-    density_kg_m3=300.0,
-    youngs_modulus_pa=100.8e3,
-    gravity_m_s2=9.81,
-    damping_n_s_m2=6.0,
-    torque_damping_n_s=0.02,
-    actuators=Actuators(
-        angles_deg=(180.0, 0.0),  # a chamber pushes: the one at -x bends the module towards +x
-        offset_ratio=0.7,
-        area_ratio=0.24,
-        rest_stress_pa=-P_MIN_BAR * PASCAL_PER_BAR,
-        full_stress_pa=-P_MAX_BAR * PASCAL_PER_BAR,
-        weight=(-10.5, 18.0, -6.5),  # 1 at rest; grows as the chamber bulges
-        valve_lag_s=0.03,
-        chamber_lag_s=0.06,
-    ),
-    time_step_s=2.5e-4,
-    period_s=0.4,
-    axial_ratio=1.8,
-    rotary_inertia_ratio=5.0,
-    connector_mass_kg=0.0035,
-    tip_mass_kg=0.0005,
-    stiffening_weight_n=0.1555,
-    stiffening_power=3.04,
-    stiffest_ratio=9.0,  # the third module from the tip has 8.6
-    friction_n_m2=1.3e-3,
-    friction_curvature_per_m=1.9,
-    settling_slices=60,
-)
-
-# The robot of two modules: 33 and 75 degrees (`down` takes the first one to 32.4). No one set of modules has the reach
-# of both robots: the modules at the tip carry the same weight, and reach 90 degrees in one and 75 in the other.
-PNEUMATIC_2 = dataclasses.replace(PNEUMATIC, youngs_modulus_pa=118.2e3, stiffening_weight_n=0.1735)
-
-PARAMETERS = {"cable": CABLE, "pneumatic": PNEUMATIC, "pneumatic-2": PNEUMATIC_2}
+def plant_of(robot: Robot) -> PlantParameters:
+    """The parameters of a robot file's robot. `RobotFileError` for one without [simulation]."""
+    values = {name: value for name, value in msgspec.structs.asdict(robot.physics).items() if value is not None}
+    offset_m, area_m2 = values.pop("actuator_offset_m"), values.pop("actuator_area_m2")
+    radius_m, cable_stress_pa = values["radius_m"], values.pop("cable_stress_pa", 0.0)
+    stress_pa = (0.0, cable_stress_pa)
+    if robot.valve is not None:
+        stress_pa = (-robot.valve.p_min_bar * PASCAL_PER_BAR, -robot.valve.p_max_bar * PASCAL_PER_BAR)
+    optional = ("longest_ratio", "valve_lag_s", "chamber_lag_s")
+    of_actuators = {name: values.pop(name) for name in optional if name in values}
+    actuators = Actuators(
+        angles_deg=robot.actuators.directions_deg,
+        directions=robot.directions,
+        offset_ratio=offset_m / radius_m,
+        area_ratio=area_m2 / (np.pi * radius_m**2),
+        rest_stress_pa=stress_pa[0],
+        full_stress_pa=stress_pa[1],
+        weight=values.pop("actuator_weight"),
+        **of_actuators,
+    )
+    del values["preset"]
+    return PlantParameters(**values, actuators=actuators, period_s=robot.loop.period_s)

@@ -12,7 +12,7 @@ from modsoft.runtime.errors import RobotFileError, UsageError
 from modsoft.runtime.robot import Robot
 from modsoft.training.simulation import fleet_kernel
 from modsoft.training.simulation.fleet import Arms, Fleet
-from modsoft.training.simulation.parameters import NOMINAL, PARAMETERS, PASCAL_PER_BAR, Perturbation
+from modsoft.training.simulation.parameters import NOMINAL, Perturbation, plant_of
 from modsoft.training.simulation.rollout import rollout
 
 
@@ -57,13 +57,13 @@ def by_fleet(
     robot: Robot, actions: Array, variant: str | None = None, *, perturbation: Perturbation = NOMINAL
 ) -> Array:
     """Robots side by side in compiled code."""
-    fleet = Fleet(robot.preset, robot.modules, len(actions), variant=variant, perturbation=perturbation)
+    fleet = Fleet(plant_of(robot), robot.modules, len(actions), variant=variant, perturbation=perturbation)
     return _run(fleet, actions, robot.loop.period_s)
 
 
 def by_elastica(robot: Robot, actions: Array, *, perturbation: Perturbation = NOMINAL) -> Array:
     """One robot after the other in PyElastica, the reference."""
-    arms = Arms(robot.preset, robot.modules, len(actions), perturbation=perturbation)
+    arms = Arms(plant_of(robot), robot.modules, len(actions), perturbation=perturbation)
     return _run(arms, actions, robot.loop.period_s)
 
 
@@ -72,20 +72,11 @@ def _run(robots: Fleet | Arms, actions: Array, period_s: float) -> Array:
 
 
 def _check(robot: Robot) -> None:
-    """Refuses a control period or pressures that the simulated robot does not support."""
-    parameters, period_s = PARAMETERS[robot.preset], robot.loop.period_s
+    """Refuses a control period that is no whole number of time steps."""
+    parameters, period_s = plant_of(robot), robot.loop.period_s
     steps = period_s / parameters.time_step_s
     if abs(steps - round(steps)) > 1e-6 * steps:
         raise RobotFileError(
             f"loop.hz {robot.loop.hz} is a period of {period_s:.6g} s; expected whole steps of "
             f"{parameters.time_step_s} s for the simulated robot"
         )
-    if robot.valve is not None:
-        stresses = (parameters.actuators.rest_stress_pa, parameters.actuators.full_stress_pa)
-        expected = [round(-stress / PASCAL_PER_BAR, 6) for stress in stresses]
-        in_file = [robot.valve.p_min_bar, robot.valve.p_max_bar]
-        if in_file != expected:
-            raise RobotFileError(
-                f"valve.p_min_bar, p_max_bar are {in_file[0]}, {in_file[1]}; expected {expected[0]}, {expected[1]}, "
-                "the pressures of the simulated robot"
-            )
