@@ -156,7 +156,7 @@ def measure(devices: Devices, robot: Robot, plan: Plan, log: RunLog) -> list[Sam
             np.full((steps, robot.modules, 3), np.nan),
             log,
             TickStatistics(devices.robot, steps),
-            status=lambda: f"channel {plan.active(control.row)}  ",
+            status=lambda: "" if (channel := plan.active(control.row)) is None else f"channel {channel}  ",
             set_points_bar=control.set_points_bar,
         )
     except Tripped as error:
