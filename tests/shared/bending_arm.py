@@ -6,7 +6,7 @@ import numpy as np
 
 from modsoft.runtime.control.features import from_directors
 
-DEG_PER_BAR = (16.0, 80.0, 210.0)  # of each module, base first, about those of pneumatic-3
+DEG_PER_BAR = (14.5, 82.0, 200.0)  # of each module, base first, as those of pneumatic-3 at 0.19 bar
 MODULE_M = 0.085
 
 
