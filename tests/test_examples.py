@@ -1,5 +1,6 @@
 """The examples run without changes and have at most forty lines."""
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from log_records import tick_record
 
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import from_angles_deg
 from modsoft.runtime.log import RunLog
 
@@ -36,6 +38,21 @@ def test_board_arms_and_vents(tmp_path):
     output = run("talk_to_the_board.py", folder=tmp_path)
     assert "0.1 " in output.split("applied, bar:")[1]
     assert "vented: True" in output
+
+
+@pytest.mark.realtime
+def test_emulated_bench_has_board_and_tracker(tmp_path):
+    (tmp_path / "robot.toml").write_text(robot_file.text_of("pneumatic-3"))
+    command = [sys.executable, "-P", EXAMPLES / "emulated_bench.py", "robot.toml", "native"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as bench:
+        line = bench.stdout.readline()
+        robot = robot_file.load(tmp_path / "bench.toml")
+        ports = [Path(robot.tracker.port).exists(), Path(robot.serial.port).exists()]
+        bench.send_signal(signal.SIGINT)
+        assert bench.wait(timeout=30) == 0
+    assert ports == [True, True]
+    assert robot.serial.port in line
+    assert all((tmp_path / tool).is_file() for tool in robot.tracker.tools)
 
 
 def test_run_log_becomes_a_picture(tmp_path):
