@@ -7,13 +7,13 @@
 #include <immintrin.h>
 #endif
 
-/* Actuators that act on a module at a time: two along the directors, or as many as `struct plant` says, anywhere around
+/* Actuators that act on a module at a time: two along the directors, or as many as `struct parameters` says, anywhere around
  * the section. */
 enum { ACTUATORS = 2, ANYWHERE = 2, MOST_ACTUATORS = 12 };
 
 /* The modules of a robot; three arrays hold the differences between its elements. fleet.py fills it in, field by field.
  * Units: the rest length of an element, the time step, and newton; so a velocity is in rest lengths a time step. */
-struct plant {
+struct parameters {
   int64_t second;        /* 0 or 1: the director that the second actuator is along; the first is along 0; or ANYWHERE */
   int64_t actuators;     /* of a module, where they are ANYWHERE */
   int64_t lags;          /* whether the actuators follow their goal late */
@@ -99,7 +99,7 @@ int fleet_lanes(int variant) {
   return 0;
 }
 
-int fleet_plant_bytes(void) { return (int)sizeof(struct plant); }
+int fleet_parameters_bytes(void) { return (int)sizeof(struct parameters); }
 
 /* Advances `blocks` blocks of robots of `modules` modules by `steps` time steps.
  *
@@ -107,19 +107,19 @@ int fleet_plant_bytes(void) { return (int)sizeof(struct plant); }
  * state (blocks, elements + 1, 20, lanes): struct element, k beside the node before it; the last node has no element.
  * Both start on a multiple of 8 * lanes bytes.
  */
-void fleet_advance(int variant, const struct plant *plant, int blocks, int modules, int per_module, double *drive,
+void fleet_advance(int variant, const struct parameters *parameters, int blocks, int modules, int per_module, double *drive,
                    double *state, long steps) {
   for (int b = 0; b < blocks; b++) {
     switch (variant) {
       case 0:
-        advance_plain(plant, b, modules, per_module, drive, state, steps);
+        advance_plain(parameters, b, modules, per_module, drive, state, steps);
         break;
 #if defined(__x86_64__)
       case 1:
-        advance_avx2(plant, b, modules, per_module, drive, state, steps);
+        advance_avx2(parameters, b, modules, per_module, drive, state, steps);
         break;
       case 2:
-        advance_avx512(plant, b, modules, per_module, drive, state, steps);
+        advance_avx512(parameters, b, modules, per_module, drive, state, steps);
         break;
 #endif
     }

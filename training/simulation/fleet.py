@@ -164,7 +164,7 @@ class Fleet:
             self._constants, self._state, self._drive, self.parameters.period_s if period_s is None else period_s
         )
 
-    def _with_arrays(self, damping: Damping) -> fleet_kernel.PlantStruct:
+    def _with_arrays(self, damping: Damping) -> fleet_kernel.Parameters:
         parameters = fleet_kernel.constants(self.parameters, damping, self.time_step_s)
         parameters.mobility = self._mobility.ctypes.data
         parameters.stiffness = self._stiffness.ctypes.data
@@ -188,7 +188,7 @@ class Fleet:
             padded[: len(values)] = values
             drive[:, :, :, row] = np.moveaxis(padded.reshape(-1, self.lanes, *values.shape[1:]), 1, -1)
 
-    def _advance(self, parameters: fleet_kernel.PlantStruct, state: Array, drive: Array, duration_s: float) -> None:
+    def _advance(self, parameters: fleet_kernel.Parameters, state: Array, drive: Array, duration_s: float) -> None:
         steps = round(duration_s / self.time_step_s)
         if not math.isclose(steps * self.time_step_s, duration_s, rel_tol=1e-9):
             raise ValueError(f"{duration_s} s is not a whole number of time steps of {self.time_step_s} s")

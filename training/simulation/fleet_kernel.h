@@ -81,7 +81,7 @@ INLINE void NAME(rotate)(V *restrict q, const V *restrict w) {
 }
 
 /* A1: drift of the element and of the node after it by a time step; length. */
-INLINE void NAME(lengths)(const struct plant *p, ELEMENT *e, WORK *o, PASSED *between) {
+INLINE void NAME(lengths)(const struct parameters *p, ELEMENT *e, WORK *o, PASSED *between) {
   V d[3], dv[3];
   for (int i = 0; i < 3; i++) {
     e[1].position[i] += e[1].velocity[i];
@@ -99,7 +99,7 @@ INLINE void NAME(lengths)(const struct plant *p, ELEMENT *e, WORK *o, PASSED *be
 }
 
 /* A2: rotation of the element by a time step; strain, stress, damping and drag. */
-INLINE void NAME(strains)(const struct plant *p, double stiffness, ELEMENT *e, WORK *o, const PASSED *between) {
+INLINE void NAME(strains)(const struct parameters *p, double stiffness, ELEMENT *e, WORK *o, const PASSED *between) {
   V u[3];
   NAME(rotate)(e->director, e->omega);
   for (int i = 0; i < 3; i++) {
@@ -133,7 +133,7 @@ INLINE void NAME(bends)(const ELEMENT *a, const ELEMENT *b, const WORK *oa, cons
 
 /* B2: curvature before an element; asin(x)/x / 4 as a series in 4 x^2 = t. Relative error below 2e-15 for 0.3 rad
  * between two elements, 2e-12 for 0.4, 2e-10 for 0.5; a robot that bends more sharply is made non-finite. */
-INLINE void NAME(curvature)(const struct plant *p, double rigidity, const WORK *oa, WORK *o, const PASSED *between) {
+INLINE void NAME(curvature)(const struct parameters *p, double rigidity, const WORK *oa, WORK *o, const PASSED *between) {
   const V *z = between->z;
   V inverse = between->inverse;
   V t = DOT(z, z), t2 = t * t, t4 = t2 * t2;
@@ -156,7 +156,7 @@ INLINE void NAME(curvature)(const struct plant *p, double rigidity, const WORK *
 }
 
 /* C1: the force of each actuator of an element. The second one is along axis `second`, or all are anywhere. */
-INLINE void NAME(pulls)(const struct plant *p, int second, const DRIVE *drive, const WORK *o, const WORK *after,
+INLINE void NAME(pulls)(const struct parameters *p, int second, const DRIVE *drive, const WORK *o, const WORK *after,
                         PASSED *between) {
   V curl[3], slope = o->slope + after->slope;
   for (int i = 0; i < 3; i++) {
@@ -183,7 +183,7 @@ INLINE void NAME(pulls)(const struct plant *p, int second, const DRIVE *drive, c
 }
 
 /* What the friction of the wall adds to the bending couple m: a spring whose other end slips. */
-INLINE void NAME(rub)(const struct plant *p, const V *kappa, V *slip, V *m) {
+INLINE void NAME(rub)(const struct parameters *p, const V *kappa, V *slip, V *m) {
   const V one = (V){0} + 1.0;
   V d0 = kappa[0] - slip[0], d1 = kappa[1] - slip[1];
   V far = NAME(root)(d0 * d0 + d1 * d1);
@@ -198,7 +198,7 @@ INLINE void NAME(rub)(const struct plant *p, const V *kappa, V *slip, V *m) {
 }
 
 /* C2: forces on the two nodes, and the couple towards the element before. */
-INLINE void NAME(forces)(const struct plant *p, int rubs, int second, const DRIVE *drive, ELEMENT *e,
+INLINE void NAME(forces)(const struct parameters *p, int rubs, int second, const DRIVE *drive, ELEMENT *e,
                          const WORK *before, WORK *o, const PASSED *between) {
   const V *q = e->director;
   V pair[3] = {{0}}, n[3], m[3];
@@ -247,7 +247,7 @@ INLINE void NAME(forces)(const struct plant *p, int rubs, int second, const DRIV
 }
 
 /* D: kick of the element and of the node before it. */
-INLINE void NAME(kick)(const struct plant *p, double mobility, ELEMENT *e, const WORK *before, const WORK *o,
+INLINE void NAME(kick)(const struct parameters *p, double mobility, ELEMENT *e, const WORK *before, const WORK *o,
                        const WORK *after) {
   const V *s = o->strain, *n = o->force;
   V w[3] = {e->omega[0], e->omega[1], e->omega[2]};
@@ -270,7 +270,7 @@ INLINE void NAME(kick)(const struct plant *p, double mobility, ELEMENT *e, const
 
 /* The data of one turn of the sweep, at the front element k. */
 struct NAME(front) {
-  const struct plant *plant;
+  const struct parameters *parameters;
   ELEMENT *elements;
   WORK *ring;
   const DRIVE *drive; /* of the module of element k - LAG_C */
@@ -281,7 +281,7 @@ struct NAME(front) {
  * order, and C1, C2; the rest of the order is for speed. With AVX-512 all of A and B first is a tenth faster. */
 INLINE void NAME(turn)(const struct NAME(front) * f, int inside, int rubs, int second, int k) {
 #define AT(k) (f->ring + ((k) & (RING - 1)))
-  const struct plant *p = f->plant;
+  const struct parameters *p = f->parameters;
   ELEMENT *e = f->elements;
   PASSED between;
   int c = k - LAG_C, d = k - LAG_D;
@@ -327,7 +327,7 @@ INLINE void NAME(turn)(const struct NAME(front) * f, int inside, int rubs, int s
 }
 
 /* One time step: drift, then kick. The first node and element are clamped: at rest, and never kicked. */
-INLINE void NAME(sweep)(const struct plant *p, int rubs, int second, int elements, int per_module, const DRIVE *drive,
+INLINE void NAME(sweep)(const struct parameters *p, int rubs, int second, int elements, int per_module, const DRIVE *drive,
                         ELEMENT *e) {
   WORK ring[RING];
   struct NAME(front) front = {p, e, ring, drive, elements}, *f = &front;
@@ -352,7 +352,7 @@ INLINE void NAME(sweep)(const struct plant *p, int rubs, int second, int element
 }
 
 /* Valve after its set-point, chamber after its valve. */
-INLINE void NAME(follow)(const struct plant *p, int drives, DRIVE *drive) {
+INLINE void NAME(follow)(const struct parameters *p, int drives, DRIVE *drive) {
   for (int i = 0; i < drives; i++) {
     drive[i].valve += p->valve_share * (drive[i].goal - drive[i].valve);
     drive[i].force += p->chamber_share * (drive[i].valve - drive[i].force);
@@ -371,7 +371,7 @@ static void NAME(drift)(int elements, ELEMENT *e, double part) {
   }
 }
 
-static void NAME(advance)(const struct plant *p, int block, int modules, int per_module, double *drives, double *state,
+static void NAME(advance)(const struct parameters *p, int block, int modules, int per_module, double *drives, double *state,
                           long steps) {
   int elements = modules * per_module;
   ELEMENT *e = (ELEMENT *)state + (long)block * (elements + 1);

@@ -22,8 +22,8 @@ VARIANTS = ("plain", "avx2", "avx512")  # by the instructions they need
 LIMIT = "MODSOFT_KERNEL"  # environment variable: the highest variant to use; unset or empty: no limit
 
 
-class PlantStruct(ctypes.Structure):
-    """`struct plant` of fleet.c, field by field."""
+class Parameters(ctypes.Structure):
+    """`struct parameters` of fleet.c, field by field."""
 
     _fields_ = (
         ("second", ctypes.c_int64),
@@ -59,7 +59,7 @@ def library() -> ctypes.CDLL | None:
     if spec is None or spec.origin is None:
         return None
     kernel = ctypes.CDLL(spec.origin)
-    if kernel.fleet_plant_bytes() != ctypes.sizeof(PlantStruct):
+    if kernel.fleet_parameters_bytes() != ctypes.sizeof(Parameters):
         raise ModsoftError(f"{spec.origin} is not of this version of modsoft; install it again (make install)")
     integer, pointer = ctypes.c_int, ctypes.c_void_p
     kernel.fleet_advance.argtypes = [integer, pointer, integer, integer, integer, *[pointer] * 2, ctypes.c_long]
@@ -83,7 +83,7 @@ def variants() -> list[str]:
     return [] if kernel is None else [name for i, name in enumerate(allowed) if kernel.fleet_lanes(i)]
 
 
-def constants(parameters: PlantParameters, damping: Damping, time_step_s: float) -> PlantStruct:
+def constants(parameters: PlantParameters, damping: Damping, time_step_s: float) -> Parameters:
     """The parameters in the kernel's units, without the four arrays.
 
     Those of the rod are PyElastica's: a disk's second moments, 27/28 for the shear of a section, a third of Young's
@@ -108,7 +108,7 @@ def constants(parameters: PlantParameters, damping: Damping, time_step_s: float)
     shares = [1.0 - math.exp(-time_step_s / lag) if lag else 1.0 for lag in lags]
     if len(actuators.weight) > 4:
         raise ModsoftError(f"an actuator's weight has {len(actuators.weight)} coefficients, expected at most 4")
-    return PlantStruct(
+    return Parameters(
         second=ANYWHERE if second is None else second,
         actuators=len(actuators.angles_deg),
         lags=any(lags),
