@@ -107,8 +107,8 @@ int fleet_parameters_bytes(void) { return (int)sizeof(struct parameters); }
  * state (blocks, elements + 1, 20, lanes): struct element, k beside the node before it; the last node has no element.
  * Both start on a multiple of 8 * lanes bytes.
  */
-void fleet_advance(int variant, const struct parameters *parameters, int blocks, int modules, int per_module, double *drive,
-                   double *state, long steps) {
+void fleet_advance(int variant, const struct parameters *parameters, int blocks, int modules, int per_module,
+                   double *drive, double *state, long steps) {
   for (int b = 0; b < blocks; b++) {
     switch (variant) {
       case 0:

@@ -133,7 +133,8 @@ INLINE void NAME(bends)(const ELEMENT *a, const ELEMENT *b, const WORK *oa, cons
 
 /* B2: curvature before an element; asin(x)/x / 4 as a series in 4 x^2 = t. Relative error below 2e-15 for 0.3 rad
  * between two elements, 2e-12 for 0.4, 2e-10 for 0.5; a robot that bends more sharply is made non-finite. */
-INLINE void NAME(curvature)(const struct parameters *p, double rigidity, const WORK *oa, WORK *o, const PASSED *between) {
+INLINE void NAME(curvature)(const struct parameters *p, double rigidity, const WORK *oa, WORK *o,
+                            const PASSED *between) {
   const V *z = between->z;
   V inverse = between->inverse;
   V t = DOT(z, z), t2 = t * t, t4 = t2 * t2;
@@ -327,8 +328,8 @@ INLINE void NAME(turn)(const struct NAME(front) * f, int inside, int rubs, int s
 }
 
 /* One time step: drift, then kick. The first node and element are clamped: at rest, and never kicked. */
-INLINE void NAME(sweep)(const struct parameters *p, int rubs, int second, int elements, int per_module, const DRIVE *drive,
-                        ELEMENT *e) {
+INLINE void NAME(sweep)(const struct parameters *p, int rubs, int second, int elements, int per_module,
+                        const DRIVE *drive, ELEMENT *e) {
   WORK ring[RING];
   struct NAME(front) front = {p, e, ring, drive, elements}, *f = &front;
   int left = per_module + LAG_C; /* turns until stage C comes to the next module */
@@ -371,8 +372,8 @@ static void NAME(drift)(int elements, ELEMENT *e, double part) {
   }
 }
 
-static void NAME(advance)(const struct parameters *p, int block, int modules, int per_module, double *drives, double *state,
-                          long steps) {
+static void NAME(advance)(const struct parameters *p, int block, int modules, int per_module, double *drives,
+                          double *state, long steps) {
   int elements = modules * per_module;
   ELEMENT *e = (ELEMENT *)state + (long)block * (elements + 1);
   int count = modules * COUNT(p, p->second);
