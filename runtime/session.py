@@ -19,7 +19,7 @@ from modsoft.runtime.arrays import Array
 from modsoft.runtime.calibration.use import NONE_IN_USE
 from modsoft.runtime.control import correction
 from modsoft.runtime.control.controller import Controller
-from modsoft.runtime.control.features import bending_angle_deg
+from modsoft.runtime.control.features import angle_deg
 from modsoft.runtime.control.model import Model
 from modsoft.runtime.control.tasks import load_task, task_of
 from modsoft.runtime.devices import DeviceOptions, DeviceSetup
@@ -112,7 +112,8 @@ def _setup(options: Options) -> Setup:
 def _describe(setup: Setup, rest: Array) -> None:
     """Reports what is going to run. rest: configuration (N, 3)."""
     robot, steps = setup.devices.robot, len(setup.desired)
-    angles = ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in bending_angle_deg(rest))  # not -0.0
+    rest_deg = angle_deg(rest, robot.motion).round(1) + 0.0  # not -0.0
+    angles = ", ".join(f"{angle:.1f}" for angle in rest_deg)
     say(f"robot {robot.name}, {robot.modules} modules, hangs at {angles} degrees")
     say(str(setup.devices.calibration or NONE_IN_USE))
     say(f"model {setup.options.model}, task {setup.task}: {steps} steps, {steps * robot.loop.period_s:.0f} s")

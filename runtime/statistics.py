@@ -9,7 +9,7 @@ import numpy as np
 
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.clock import LATE_MS
-from modsoft.runtime.control.features import bending_error_deg
+from modsoft.runtime.control.features import error_deg
 from modsoft.runtime.log_record import TickRecord
 from modsoft.runtime.robot import Robot
 
@@ -40,7 +40,7 @@ class TickStatistics:
         if record.configuration is None:
             self.bad[record.frame_status] += 1
         elif not np.isnan(record.desired).any():
-            self.error_deg.append(bending_error_deg(record.configuration, record.desired))
+            self.error_deg.append(error_deg(record.configuration, record.desired, self.robot.motion))
         self.status = self._status_line(record)
         self._before_ns = record.mono_ns
 

@@ -62,7 +62,7 @@ def test_wheel_has_exactly_the_five_parts(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     tops = {"/".join(name.split("/")[:2]) for name in names if not name.split("/")[0].endswith(".dist-info")}
     assert tops == {"modsoft/runtime", "modsoft/training", "modsoft/export", "modsoft/hil", "modsoft/study"}
-    for robot in ("cable-4", "cable-6", "pneumatic-2", "pneumatic-3"):
+    for robot in ("cable-4", "cable-6", "pneumatic-2", "pneumatic-3", "pneumatic-3x3"):
         assert f"modsoft/runtime/robots/{robot}.toml" in names
     assert "modsoft/runtime/calibration/file.py" in names
     # the emulated board links a GPL library: a test tool of the checkout, never distributed

@@ -66,6 +66,19 @@ def angle_between_deg(one: Array, other: Array) -> Array:
     return np.degrees(np.arctan2(sine, x * u + y * v + z * w))
 
 
+def angle_deg(configuration: Array, motion: str) -> Array:
+    """Angle (...), degrees, between a module's end and its start: the bending angle of a planar module, signed; of a
+    module in space 0 or more."""
+    if motion == "planar":
+        return bending_angle_deg(configuration)
+    return angle_between_deg(configuration, np.array([0.0, 0.0, 1.0]))
+
+
+def error_deg(configuration: Array, desired: Array, motion: str) -> Array:
+    """Control error (...), 0 to 180 degrees: of the bending angles of planar modules, of the directions in space."""
+    return (bending_error_deg if motion == "planar" else angle_between_deg)(configuration, desired)
+
+
 def from_angles_deg(angles: Array) -> Array:
     """Planar configurations (..., 3) from bending angles (...), degrees: the inverse of `bending_angle_deg`."""
     radians = np.radians(angles)

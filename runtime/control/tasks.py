@@ -1,4 +1,4 @@
-"""Tasks: desired configurations over the control steps, from the paper's supplement (S1 to S5).
+"""Tasks: desired configurations over the control steps, from the paper's supplement (S1 to S5), and `circle`.
 
 The supplement prints 3.24 degrees for `down` with two modules. That contradicts its text ("about 30 degrees", angles
 with a sum of zero), so 32.4 is used.
@@ -24,6 +24,8 @@ REAL_STEPS = 200
 # Largest angles of the planar tasks, degrees.
 EDGE_DEG = {3: [5.4, 18.0, 90.0], 2: [21.6, 72.0]}
 DOWN_DEG = {3: [3.6, 36.0, -39.6], 2: [32.4, -32.4]}
+# Angles of `circle`, degrees: four fifths of the reach of `pneumatic-3x3` (tools/bench/reach.py).
+CIRCLE_DEG = {3: [3.5, 18.5, -47.0]}
 
 
 def _turn(phase: Array, v_z: Array, sign: Array) -> Array:
@@ -58,6 +60,13 @@ def task_planar(largest_deg: list[float]) -> Array:
     return from_angles_deg(fraction[:, None] * np.asarray(largest_deg))
 
 
+def task_circle(largest_deg: list[float]) -> Array:
+    """50 steps of bending in y, 100 of one turn, 50 back to straight, as in task C: the tip module bends back."""
+    t = np.arange(REAL_STEPS)
+    angle_rad = np.radians(np.abs(largest_deg)) * np.clip(np.minimum(t / 50, 4.0 - t / 50), 0.0, 1.0)[:, None]
+    return _turn(2 * np.pi * np.clip((t - 50) / 100, 0.0, 1.0), np.cos(angle_rad), np.sign(largest_deg))
+
+
 def next_reference(desired: Array) -> Array:
     """Reference of the network at each step (K, N, 3): S_d of eq. (1) is the desired state at the end of the period,
     which is `desired` (K, N, 3) at the start of the next one. The last configuration is repeated."""
@@ -67,7 +76,7 @@ def next_reference(desired: Array) -> Array:
 def available(motion: str, modules: int) -> list[str]:
     """Names of the tasks for a motion, "planar" or "spatial", and a number of modules."""
     if motion == "spatial":
-        return ["A", "B", "C"]
+        return ["A", "B", "C", *(["circle"] if modules in CIRCLE_DEG else [])]
     return ["edge", "down"] if modules in EDGE_DEG else []
 
 
@@ -87,6 +96,8 @@ def task(name: str, motion: str, modules: int) -> Array:
             return task_b(task_tables.circle(modules))
         case "C":
             return task_c(task_tables.bend(modules))
+        case "circle":
+            return task_circle(CIRCLE_DEG[modules])
         case "edge":
             return task_planar(EDGE_DEG[modules])
         case _:

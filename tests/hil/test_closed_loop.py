@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from bending_arm import BendingArm
 from rigid_arm import RigidArm
 
 from modsoft.hil import closed_loop
@@ -66,3 +67,22 @@ def test_run_without_a_valid_frame_is_refused():
 
     with pytest.raises(LostInRun, match="no good frame within 5 s, the last one tool hidden"):
         control(hidden)
+
+
+def test_three_chambers_a_module_are_driven_through_firmware_and_valves():
+    robot = robot_file.load("pneumatic-3x3")
+    actuation = np.array([[0.3, 0.1], [-0.2, 0.4], [0.0, -0.5]])
+
+    class InSpace(Constant):
+        def actuate(self, features):
+            return actuation
+
+    desired = np.broadcast_to([0.0, 0.0, 1.0], (STEPS, 3, 3))
+    arm = BendingArm(3, robot.actuators.directions_deg, lag_s=0.0, deg_per_bar=(10.0, 60.0, 90.0))
+    with SteppedRig(robot, arm) as rig:
+        motion = closed_loop.run(rig, lambda rest: Controller(robot, InSpace(), rest), desired)
+    reached = BendingArm(3, robot.actuators.directions_deg, lag_s=0.0, deg_per_bar=(10.0, 60.0, 90.0))
+    reached.set_pressures(pressures_bar(robot, actuation))
+    reached.advance(0.0)
+    np.testing.assert_allclose(motion.true_configuration[-1], reached.configuration, atol=0.003)
+    assert np.max(angle_between_deg(motion.measured[-1], reached.configuration)) < 0.3

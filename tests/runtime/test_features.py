@@ -67,6 +67,15 @@ def test_state_is_a_unit_vector(motion):
         np.testing.assert_allclose(c.out_of_plane_deg(bent), [np.degrees(0.3), np.degrees(np.arcsin(0.6))])
 
 
+def test_angles_and_errors_in_space():
+    bent = np.array([[0.6, 0.0, 0.8], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(c.angle_deg(bent, "spatial"), [np.degrees(np.arcsin(0.6)), 90.0, 0.0])
+    turned = bent * [-1.0, 1.0, 1.0]
+    np.testing.assert_allclose(c.error_deg(bent, turned, "spatial"), [2 * np.degrees(np.arcsin(0.6)), 0.0, 0.0])
+    np.testing.assert_allclose(c.angle_deg(turned[:1], "planar"), [-np.degrees(np.arcsin(0.6))])
+    np.testing.assert_allclose(c.error_deg(bent[:1], turned[:1], "planar"), [2 * np.degrees(np.arcsin(0.6))])
+
+
 def test_labels():
     assert np.array_equal(c.labels(2), [-1, 1])
     np.testing.assert_allclose(c.labels(4), [-1, -1 / 3, 1 / 3, 1])

@@ -15,8 +15,20 @@ from modsoft.runtime.errors import UsageError
 def test_tasks_are_unit_vectors(motion, modules):
     for name in tasks.available(motion, modules):
         desired = tasks.task(name, motion, modules)
-        assert desired.shape == (250 if motion == "spatial" else 200, modules, 3)
+        assert desired.shape == (250 if name in ("A", "B", "C") else 200, modules, 3)
         np.testing.assert_allclose(np.linalg.norm(desired, axis=-1), 1.0, atol=1e-12)
+
+
+def test_circle_bends_turns_and_returns():
+    desired = tasks.task("circle", "spatial", 3)
+    bent_deg = np.degrees(np.arccos(desired[..., 2]))
+    np.testing.assert_allclose(
+        bent_deg[[0, 25, 50, 100, 150, 175]] / [3.5, 18.5, 47.0], [[x] * 3 for x in (0, 0.5, 1, 1, 1, 0.5)], atol=1e-6
+    )
+    assert np.sign(desired[60, :, 1]).tolist() == [1, 1, -1]
+    np.testing.assert_allclose(desired[75, 2, :2], [-np.sin(np.radians(47.0)), 0.0], atol=1e-12)  # a quarter turn
+    assert np.degrees(np.arccos((desired[1:] * desired[:-1]).sum(axis=-1))).max() < 3.0
+    assert "circle" not in tasks.available("spatial", 4)
 
 
 def test_task_a_starts_straight_and_keeps_bending():

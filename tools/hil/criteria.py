@@ -22,7 +22,7 @@ from modsoft.hil.valves import (
 )
 from modsoft.runtime.arrays import Array
 from modsoft.runtime.clock import LATE_MS
-from modsoft.runtime.control.features import angle_between_deg, bending_error_deg
+from modsoft.runtime.control.features import angle_between_deg, error_deg
 from modsoft.runtime.statistics import spread
 
 # ---- Limits ----------------------------------------------------------------------------------------------------
@@ -93,8 +93,9 @@ def p99(values: Array) -> float:
 
 
 def tracking_error_deg(record: Record) -> Array:
-    """|bending angle measured at the start of tick k - desired angle of tick k|, (K, N): the paper's convention."""
-    return bending_error_deg(record.configuration, record.desired)
+    """Error (K, N) of the configuration measured at the start of tick k from that desired in tick k, degrees: the
+    paper's convention. Of planar robots the difference of the bending angles."""
+    return error_deg(record.configuration, record.desired, record.robot.motion)
 
 
 def desired_error(record: Record) -> float:

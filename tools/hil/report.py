@@ -13,7 +13,7 @@ from modsoft.hil.criteria import Assessment, Criterion, measurement_error_deg, t
 from modsoft.hil.record import Record
 from modsoft.hil.report_folder import FINISHED
 from modsoft.hil.valves import valve_difference
-from modsoft.runtime.control.features import angle_between_deg, bending_angle_deg
+from modsoft.runtime.control.features import angle_deg, out_of_plane_deg
 from modsoft.runtime.files import written
 from modsoft.runtime.statistics import spread
 from modsoft.training import plotting
@@ -65,9 +65,10 @@ def figures(record: Record) -> dict[str, Any]:
         figure |= {
             "tracking_error_deg": _by_module(error_deg),
             "tracking_error_percent": _by_module(distance),
-            "out_of_plane_deg": _by_module(_out_of_plane_deg(record)),
             "measurement_error_deg": spread(list(measurement_deg[np.isfinite(measurement_deg)])),
         }
+        if record.robot.motion == "planar":
+            figure["out_of_plane_deg"] = _by_module(out_of_plane_deg(record.configuration))
     return figure
 
 
@@ -139,7 +140,7 @@ def _row(line: Criterion, void: bool) -> str:
 def _tracking_table(values: dict[str, Any]) -> list[str]:
     """Tracking errors by module, mean ± standard deviation, and the largest."""
     rows = {
-        "bending angle, °": "tracking_error_deg",
+        "angle, °": "tracking_error_deg",
         "distance of the unit vectors, %": "tracking_error_percent",
     }
     modules = range(1, len(values["tracking_error_deg"]["mean"]) + 1)
@@ -169,9 +170,9 @@ def picture(record: Record) -> Figure:
     channels = {(c.module, c.direction_deg): c.channel for c in record.robot.chambers}
     for module in range(modules):
         above, below = panels[:, module]
-        true = bending_angle_deg(record.plant_configuration[:, module])
-        measured = bending_angle_deg(record.configuration[:, module])
-        desired = bending_angle_deg(record.desired[:, module])
+        true = angle_deg(record.plant_configuration[:, module], record.robot.motion)
+        measured = angle_deg(record.configuration[:, module], record.robot.motion)
+        desired = angle_deg(record.desired[:, module], record.robot.motion)
         above.plot(at_slice, true, color="#1f77b4", lw=1.6, label="reached by the robot")
         above.plot(at_tick, measured, ".", color="#0b3c5d", ms=3.5, label="measured by the tracker")
         above.plot(at_tick, desired, color="#d62728", lw=1.3, ls="--", label="desired")
@@ -208,13 +209,6 @@ def _by_module(values: np.ndarray) -> dict[str, list[float]]:
         "std": np.nanstd(values, axis=0).tolist(),
         "max": np.nanmax(values, axis=0).tolist(),
     }
-
-
-def _out_of_plane_deg(record: Record) -> np.ndarray:
-    flat = record.configuration.copy()
-    flat[..., 1] = 0.0
-    flat /= np.linalg.norm(flat, axis=-1, keepdims=True)
-    return angle_between_deg(record.configuration, flat)
 
 
 def _plain(value: Any) -> Any:
