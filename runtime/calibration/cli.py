@@ -11,7 +11,10 @@ import click
 from modsoft.runtime.calibration import board_cli
 from modsoft.runtime.entry_point import entry
 
-OPTIONS = (
+Option = Callable[[Any], Any]
+
+_FILE = click.Path(path_type=Path)
+_OPTIONS = (
     click.option(
         "--robot", default="robot.toml", show_default=True, metavar="FILE|NAME", help="Robot file, or a shipped robot."
     ),
@@ -26,34 +29,40 @@ OPTIONS = (
         "tools",
         multiple=True,
         metavar="FILE",
-        type=click.Path(path_type=Path),
+        type=_FILE,
         help="Tool definition file, once for each tool: base, then module 1 to N. [default: tools under [tracker] in "
         "the robot file]",
     ),
     click.option(
         "--calibration",
         metavar="FILE",
-        type=click.Path(path_type=Path),
+        type=_FILE,
         help="Calibration file to write. [default: NAME.calibration.toml beside NAME.toml, the robot file]",
-    ),
-    click.option(
-        "--picture",
-        metavar="FILE",
-        type=click.Path(path_type=Path),
-        help="Picture of the result to write, with matplotlib. [default: the calibration file, ending in .png]",
-    ),
-    click.option(
-        "--frames", default=100, show_default=True, metavar="N", type=click.IntRange(20), help="Frames to average."
     ),
     click.option("--yes", is_flag=True, help="Measure without asking."),
 )
 
 
-def tool_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The options of commands that measure the tools."""
-    for option in reversed(OPTIONS):
-        function = option(function)
-    return function
+_PICTURE = click.option(
+    "--picture",
+    metavar="FILE",
+    type=_FILE,
+    help="Picture of the result to write, with matplotlib. [default: the calibration file, ending in .png]",
+)
+
+
+def _tool_options(frames: int, *more: Option) -> Option:
+    """The options of commands that measure the tools in `frames` frames by default, and `more`."""
+    count = click.option(
+        "--frames", default=frames, show_default=True, metavar="N", type=click.IntRange(20), help="Frames to measure."
+    )
+
+    def decorated(function: Any) -> Any:
+        for option in reversed((*_OPTIONS, count, *more)):
+            function = option(function)
+        return function
+
+    return decorated
 
 
 @click.group("modsoft-calibrate", context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
@@ -67,7 +76,7 @@ def cli() -> None:
 
 
 @cli.command()
-@tool_options
+@_tool_options(100, _PICTURE)
 @click.option(
     "--module",
     "only",
@@ -89,12 +98,32 @@ def rest(only: tuple[int, ...], **options: Any) -> None:
 
 
 @cli.command()
-@tool_options
+@_tool_options(100, _PICTURE)
 def noise(**options: Any) -> None:
     """Measure the noise of the tools at rest, and what it costs."""
     from modsoft.runtime.calibration.commands import Options, measure_noise
 
     measure_noise(Options(**options))
+
+
+@cli.command()
+@_tool_options(600)
+@click.option(
+    "--run",
+    metavar="FOLDER",
+    type=_FILE,
+    help="Use the frames of this recorded run, in which the modules bent. [default: those of the tracker now]",
+)
+def base(run: Path | None, **options: Any) -> None:
+    """Measure how the base's tool is mounted, while the modules bend.
+
+    After rest, the axes of the base's tool are those of the robot. Modules that bend without twist show the plane of a
+    planar robot, or the z axis of a spatial one. Bend every module by hand in every direction of its motion, or give a
+    run. modsoft-runtime then corrects every frame for it; a network needs data of the same frame.
+    """
+    from modsoft.runtime.calibration.commands import Options, calibrate_base
+
+    calibrate_base(Options(**options, picture=None, run=run))
 
 
 cli.add_command(board_cli.channels)

@@ -1,17 +1,19 @@
-"""The commands that measure tools at rest: `modsoft-calibrate rest` and `noise`."""
+"""The commands that measure tools: `modsoft-calibrate rest`, `noise` and `base`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
+import numpy as np
 
 from modsoft.runtime import robot as robot_file
-from modsoft.runtime.calibration import file, rest
+from modsoft.runtime.calibration import base, file, rest
 from modsoft.runtime.calibration.file import Calibration
-from modsoft.runtime.calibration.measure import Collector
+from modsoft.runtime.calibration.measure import FEWEST_FRAMES, Collector
 from modsoft.runtime.calibration.picture import draw
 from modsoft.runtime.calibration.rest import Measured
 from modsoft.runtime.calibration.use import hashes
@@ -19,11 +21,14 @@ from modsoft.runtime.devices import confirm
 from modsoft.runtime.errors import ModelError, UsageError
 from modsoft.runtime.files import check_not_input, check_writable
 from modsoft.runtime.robot import Robot
+from modsoft.runtime.safety import GOOD, FrameValidator
 from modsoft.runtime.terminal import say
-from modsoft.runtime.tracking.frame import LatestFrame
+from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 from modsoft.runtime.tracking.reader import Reader
+from modsoft.runtime.tracking.replay import recorded
 from modsoft.runtime.tracking.sources import open_source, port_of
 
+BEND = "Ready to bend every module by hand, {where}, without twisting it? Press Enter to begin, Ctrl-C to leave. "
 QUESTION = "Is the robot vented, and does it hang straight and still? Press Enter to measure, Ctrl-C to leave. "
 
 
@@ -35,13 +40,15 @@ class Options:
     tracker_port: str
     tools: tuple[Path, ...]
     calibration: Path | None
-    picture: Path | None
+    picture: Path | None  # unused by base
     frames: int
     yes: bool
+    run: Path | None = None  # base: whose frames are used
 
 
 class Command:
-    """The robot and its files, checked before the tracker is opened."""
+    """The robot and its files, checked before the tracker is opened. `frames`: to measure; `before`: the calibration so
+    far."""
 
     def __init__(self, options: Options):
         self.options = options
@@ -51,6 +58,7 @@ class Command:
         self.tools = list(options.tools) or [folder / tool for tool in self.robot.tracker.tools]
         self.path = options.calibration or file.path_for(options.robot)
         self.picture = options.picture or self.path.with_suffix(".png")
+        self.device = ""
         for output in (self.path, self.picture):
             check_not_input(output, Path(options.robot), *self.tools)
             check_writable(output)
@@ -64,19 +72,26 @@ class Command:
         self.before = file.read(self.path)
         file.check(self.before, self.robot, self.hashes, self.path, list(without))
 
-    def measure(self) -> Measured:
-        """Asks for a robot at rest, and measures it."""
+    @contextmanager
+    def tracker(self, question: str) -> Iterator[LatestFrame]:
+        """Asks the operator, and opens the tracker."""
         if not self.options.yes:
-            confirm(QUESTION)
+            confirm(question)
         frames = LatestFrame()
         source = open_source(self.robot, self.port, self.tools)
+        self.device = source.device
         reader = Reader(source, frames)
         try:
-            tools = Collector(self.robot, frames, self.options.frames).run()
+            yield frames
         finally:
             reader.close()
+
+    def measure(self) -> Measured:
+        """The robot at rest."""
+        with self.tracker(QUESTION) as frames:
+            tools = Collector(self.robot, frames, self.options.frames).run()
         names = [path.name for path in self.tools] or [""] * len(self.hashes)
-        return Measured(tools, source.device, names, self.hashes, file.now())
+        return Measured(tools, self.device, names, self.hashes, file.now())
 
     def write(self, measured: Measured, calibration: Calibration) -> None:
         """Writes the file, then the picture."""
@@ -118,3 +133,34 @@ def measure_noise(options: Options) -> None:
     for line in rest.report(measured):
         click.echo(line)
     click.echo(f"not stored: no calibration {command.path}; run modsoft-calibrate rest")
+
+
+def calibrate_base(options: Options) -> None:
+    """`modsoft-calibrate base`."""
+    command = Command(options)
+    command.read_before()
+    before, planar = command.before, command.robot.motion == "planar"
+    assert before is not None
+    if options.run is not None:
+        poses = np.array([frame.poses for frame in _valid_frames(options.run, command.robot)])
+    else:
+        with command.tracker(BEND.format(where="in its plane" if planar else "in every direction")) as frames:
+            collector = Collector(
+                command.robot, frames, options.frames, describe=lambda poses: str(base.frame_of(poses, before, planar))
+            )
+            poses = collector.collect()
+    frame = base.frame_of(poses, before, planar)
+    calibration = base.aligned(frame, before, planar, file.now())
+    file.write(command.path, calibration)
+    click.echo(f"{len(poses)} frames: {frame}")
+    click.echo(f"wrote {command.path}")
+
+
+def _valid_frames(run: Path, robot: Robot) -> list[TrackerFrame]:
+    """The frames of a run in which every tool was measured. `ModelError` for too few."""
+    validator = FrameValidator(robot)
+    path = run / "run.jsonl" if run.is_dir() else run
+    frames = [frame for frame in recorded(path, robot.modules + 1) if validator.measured(frame)[0] == GOOD]
+    if len(frames) < FEWEST_FRAMES:
+        raise ModelError(f"{path}: found {len(frames)} valid frames, expected at least {FEWEST_FRAMES}")
+    return frames

@@ -58,9 +58,12 @@ class Tool(Section, frozen=True):
 
 
 class Base(Tool, frozen=True):
-    """`[base]`: the base's tool. `rotation_deg`: of the tool in the robot's frame; 0 where its axes are the robot's."""
+    """`[base]`: the base's tool. `rotation_deg`: of the tool in the robot's frame; 0 where its axes are the robot's.
+    `rotation_date`: when bends showed it; empty if none did. `rotation_residual_deg`: `off_deg` of `base.Frame`."""
 
     rotation_deg: Rotation = (0.0, 0.0, 0.0)
+    rotation_date: Annotated[str, Meta(pattern=r"^(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ)?$")] = ""
+    rotation_residual_deg: Deviation = 0.0
 
 
 class Module(Tool, frozen=True):

@@ -51,16 +51,23 @@ class Collector:
         count: int = FRAMES,
         now: Callable[[], float] = time.monotonic,
         wait: Callable[[float], object] = time.sleep,
+        describe: Callable[[Array], str] | None = None,
     ):
+        """describe: text about poses (K, T, 4, 4) for the status line, by default their noise."""
         self._validator, self._frames, self._count = FrameValidator(robot), frames, count
-        self._now, self._wait = now, wait
+        self._now, self._wait, self._describe = now, wait, describe or noise_text
         self._poses: list[Array] = []
         self._newest = -1
         self._problem = ""  # of the newest frame
 
     def run(self) -> Tools:
-        """Shows the frames and their noise in a status line meanwhile. Raises `DeviceAbsent` for too few valid frames,
-        `Tripped` for a robot that moves and for noise above the limit."""
+        """The tools at rest. Raises as `collect`, and `Tripped` for a robot that moves, and for too much noise."""
+        tools = at_rest(self.collect())
+        check_still(tools)
+        return tools
+
+    def collect(self) -> Array:
+        """Poses (K, T, 4, 4) of K valid frames; shows a status line meanwhile. Raises `DeviceAbsent` for too few."""
         began_s = valid_s = self._now()
         with StatusLine(self.status, sys.stderr):
             while len(self._poses) < self._count:
@@ -75,21 +82,14 @@ class Collector:
                         f"the last one {self._problem or self._frames.problem or 'missing'}; are all tools in view?"
                     )
                 self._wait(POLL_S)
-        tools = at_rest(np.array(self._poses))
-        check_still(tools)
-        return tools
+        return np.array(self._poses)
 
     def status(self) -> str:
-        """Frames so far, and the noise of each tool."""
+        """Frames so far, and what they show."""
         poses = self._poses[:]
         text = f"{len(poses)} of {self._count} frames"
         if len(poses) >= FEWEST_FRAMES:
-            tools = at_rest(np.array(poses))
-            each = zip(tools.noise_deg, tools.noise_mm, tools.residual_deg, strict=True)
-            text += "; noise, residual: " + ", ".join(
-                f"{tool_name(tool)} {deg:.2f} deg {mm:.2f} mm, {off:.2f} deg"
-                for tool, (deg, mm, off) in enumerate(each)
-            )
+            text += f"; {self._describe(np.array(poses))}"
         return f"{text}; {self._problem}" if self._problem else text
 
     def _take(self) -> bool:
@@ -105,6 +105,15 @@ class Collector:
         self._problem = ""
         self._poses.append(frame.poses)
         return True
+
+
+def noise_text(poses: Array) -> str:
+    """Noise and residual of each tool, by poses (K, T, 4, 4)."""
+    tools = at_rest(poses)
+    each = zip(tools.noise_deg, tools.noise_mm, tools.residual_deg, strict=True)
+    return "noise, residual: " + ", ".join(
+        f"{tool_name(tool)} {deg:.2f} deg {mm:.2f} mm, {off:.2f} deg" for tool, (deg, mm, off) in enumerate(each)
+    )
 
 
 def at_rest(poses: Array) -> Tools:

@@ -1,5 +1,6 @@
 """`modsoft-calibrate`: the file, the backup and the picture that it writes, and what it refuses in one line."""
 
+import json
 import sys
 import threading
 
@@ -167,6 +168,45 @@ def test_input_files_are_not_replaced(option, name, bench):
     message = refusal(lambda: bench.run("rest", "--yes", option, name), UsageError)
     assert "which would be replaced" in message
     assert robot_file.load("robot.toml").name == "arm"
+
+
+def bend(at_s):
+    """Bends in the plane, as by hand."""
+    return [[0.0, 30.0 * np.sin(at_s + module), 0.0] for module in range(3)]
+
+
+def test_base_stores_the_frame_that_bends_show(bench):
+    assert "run modsoft-calibrate rest" in refusal(lambda: bench.run("base", "--yes"), ModelError)
+    bench.run("rest", "--yes")
+    before = bench.calibration
+    assert "expected at least 10 in its plane" in refusal(lambda: bench.run("base", "--yes"), Tripped)
+    assert bench.calibration == before
+    bench.tracker.bends = bend
+    output = bench.run("base", "--yes", "--frames", "200")
+    assert output.splitlines()[-1] == "wrote robot.calibration.toml"
+    assert "the base's tool is turned by 0." in output
+    assert bench.calibration.base.rotation_date != ""
+    assert bench.calibration.modules == before.modules
+
+
+def test_base_uses_the_frames_of_a_run(bench):
+    bench.run("rest", "--yes")
+    bench.tracker.bends = bend
+    lines = []
+    for tick in range(60):
+        bench.tracker.wait(0.0)
+        frame = bench.tracker.frames.latest()
+        pose = {"poses": frame.poses.tolist(), "valid": [tick != 7, True, True, True], "quality": [0.1] * 4}
+        lines.append(json.dumps({"tick": tick, "frame": {"number": tick, "mono_ns": tick * 10**8, **pose}}))
+    run = bench.folder / "runs" / "1"
+    run.mkdir(parents=True)
+    (run / "run.jsonl").write_text("\n".join(lines[:10]) + "\n")
+    assert "found 9 valid frames, expected at least 20" in refusal(
+        lambda: bench.run("base", "--run", str(run)), ModelError
+    )
+    (run / "run.jsonl").write_text("\n".join(lines) + "\n")
+    assert bench.run("base", "--run", str(run)).startswith("59 frames: the base's tool is turned by 0.")
+    assert bench.calibration.base.rotation_date != ""
 
 
 def test_picture_and_calibration_need_two_names(bench):
