@@ -22,7 +22,7 @@ SOURCES = [
     *(ROOT / "runtime" / f"{name}.py" for name in ("calibration/mounting", "devices", "loop", "safety", "shutdown")),
 ]
 # `kind` and `missing` are variables with one of these errors; `_lose` ends the connection with a reason.
-RAISED = {"Tripped", "LostInRun", "ProtocolMismatch", "PortBusy", "DeviceAbsent", "kind", "missing", "_lose"}
+RAISED = {"Tripped", "LostInRun", "ModelError", "ProtocolMismatch", "PortBusy", "DeviceAbsent", "kind", "missing", "_lose"}
 LEAST = 10  # letters of a message that identify it
 
 
