@@ -148,10 +148,17 @@ class Rig:
         Its log goes to a folder in `runs` (None: a new folder in the rig's own), its output to runtime.out and
         runtime.err. options: further options of modsoft-runtime.
         """
-        script = self._script("modsoft-runtime")
         self.runs = runs or Path(tempfile.mkdtemp(prefix=LOG_PREFIX, dir=self.folder))
-        command = [script, "--yes", *self._of_tracker, "--tracker", "ndi", "--port", self.board.port]
-        command += ["--model", str(model), "--task", task, "--runs-dir", str(self.runs), *options]
+        task_options = ("--model", str(model), "--task", task, "--tracker", "ndi", "--runs-dir", str(self.runs))
+        return self._start("modsoft-runtime", *task_options, *options)
+
+    def collect(self, out: Path, *options: str) -> subprocess.Popen[bytes]:
+        """Starts the unmodified modsoft-collect in the same way; it writes the data set `out`."""
+        self.runs = out.with_name(f"{out.name}.runs")
+        return self._start("modsoft-collect", "--out", str(out), *options)
+
+    def _start(self, name: str, *options: str) -> subprocess.Popen[bytes]:
+        command = [self._script(name), "--yes", *self._of_tracker, "--port", self.board.port, *options]
         with (self.folder / "runtime.out").open("wb") as out, (self.folder / "runtime.err").open("wb") as errors:
             self.runtime = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=errors, start_new_session=True
