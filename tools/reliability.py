@@ -191,6 +191,11 @@ ROWS: dict[int, Row] = {
     ),
     60: Row("tools swapped, hidden during a pulse", "named; no valve opens unobserved", "all; vented"),
     61: Row("end of a calibration: signal, key, error, lost device", "vent as row 12", "all 0 at any phase"),
+    62: Row("collection of data: killed (SIGKILL)", "the same command continues", "no recorded sample lost"),
+    63: Row("collection: tracker lost", "vent; the same command continues", "no recorded sample lost"),
+    64: Row("collection: board lost or restarted", "vent; the same command continues", "no recorded sample lost"),
+    65: Row("collection: disk full", "vent; the same command continues", "no sample lost that was written before"),
+    66: Row("collection: paused", "vent; the key continues", "no recorded sample lost; all 0 in the pause"),
 }
 
 CLOCKS = {"emulated": "board's cycles", "virtual": "injected", "host": "wall", "none": ""}

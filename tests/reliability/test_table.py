@@ -42,7 +42,7 @@ def run_tool(folder, *lines):
     return done.returncode, done.stdout + done.stderr, page.read_text() if page.exists() else ""
 
 
-ALL = [*range(1, 62)]
+ALL = [*range(1, 67)]
 COUNT = len(ALL)
 
 

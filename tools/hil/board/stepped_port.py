@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -76,6 +77,7 @@ class SteppedPort:
         to_host = self._board.run(microseconds, self._from_host)["to_host"]
         in_transit = min(to_host - self._taken, BUFFERED_AT_MOST)
         until_s = time.monotonic() + ARRIVES_IN_S
-        while self.in_waiting < in_transit and time.monotonic() < until_s:
-            time.sleep(0)
+        with contextlib.suppress(OSError):  # the cable was pulled: the next read or write reports it
+            while self.in_waiting < in_transit and time.monotonic() < until_s:
+                time.sleep(0)
         self._on_step(microseconds * 1e-6)
