@@ -17,14 +17,15 @@ from modsoft.hil.plant import load_robot
 from modsoft.hil.rig import Rig
 from modsoft.runtime.control.features import angle_between_deg
 from modsoft.runtime.entry_point import entry
-from modsoft.runtime.errors import LostInRun
+from modsoft.runtime.errors import DeviceAbsent, LostInRun
 from modsoft.runtime.files import make_folder
 from modsoft.training.data import dataset
 from modsoft.training.data.dataset import DataSet
 from modsoft.training.data.recording import Plan, Runs
 
 LARGEST_MEAN_DEG, LARGEST_P99_DEG = 0.1, 1.0
-MOST_STARTS = 20  # in real time: a busy computer loses a device, and the same command continues
+DEVICE_CODES = (DeviceAbsent.exit_code, LostInRun.exit_code)
+MOST_STARTS = 50  # in real time: a busy computer loses a device, and the same command continues
 START_S = 120.0  # for processes and devices to start, and to end
 
 
@@ -71,9 +72,9 @@ def run(robot_name: str, folder: Path, samples: int, steps: int, board: str = "a
     real, stepped = folder / "real.h5", folder / "stepped.h5"
     seconds = Plan.of(robot, 0, steps).ticks(-(-samples // steps)) * robot.loop.period_s
     options = ("--samples", str(samples), "--steps", str(steps))
-    code, starts = LostInRun.exit_code, 0
+    code, starts = DEVICE_CODES[0], 0
     with Rig(robot_name, folder / "rig", board) as rig:
-        while code == LostInRun.exit_code and starts < MOST_STARTS:
+        while code in DEVICE_CODES and starts < MOST_STARTS:
             rig.collect(real, *options)
             code, starts = rig.wait(2 * seconds + START_S), starts + 1
         if code != 0:
