@@ -21,8 +21,9 @@ SOURCES = [
     *sorted((ROOT / "runtime" / "tracking").glob("*.py")),
     *(ROOT / "runtime" / f"{name}.py" for name in ("calibration/mounting", "devices", "loop", "safety", "shutdown")),
 ]
+ERRORS = {"Tripped", "LostInRun", "ModelError", "ProtocolMismatch", "PortBusy", "DeviceAbsent"}
 # `kind` and `missing` are variables with one of these errors; `_lose` ends the connection with a reason.
-RAISED = {"Tripped", "LostInRun", "ModelError", "ProtocolMismatch", "PortBusy", "DeviceAbsent", "kind", "missing", "_lose"}
+RAISED = ERRORS | {"kind", "missing", "_lose"}
 LEAST = 10  # letters of a message that identify it
 
 
