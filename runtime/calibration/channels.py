@@ -172,8 +172,8 @@ def describe(pulse: Pulse, place: Place | None) -> str:
     what = str(place) if place is not None else "no module moves" if pulse.module is None else "no single chamber"
     if place is not None:
         what += f", bends it by {pulse.bend_deg[place.module - 1]:.1f} degrees"
-    if not np.isnan(pulse.share):
-        what += f"; {pulse.rise_bar[pulse.channel]:.2f} of {pulse.pressure_bar:.2f} bar"
+    rise_bar = pulse.rise_bar[pulse.channel]
+    what += "; no sensor" if np.isnan(rise_bar) else f"; {rise_bar:.2f} of {pulse.pressure_bar:.2f} bar"
     return f"channel {pulse.channel}: {what}"
 
 

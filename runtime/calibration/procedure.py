@@ -272,7 +272,8 @@ def _write(options: Options, path: Path, setup: DeviceSetup, result: Result) -> 
         return
     for line in [f"changes of {path}:", *lines]:
         click.echo(line)
-    if not options.yes:
-        click.confirm(f"Write {path}?", abort=True, err=True)
+    if not options.yes and not click.confirm(f"Write {path}?", err=True):
+        click.echo(f"{path} is not changed")
+        return
     backup = replace_chambers(path, setup.robot_text, result.chambers)
     click.echo(f"{path} is written; the file before is {backup}")

@@ -82,6 +82,12 @@ def test_no_other_valve_opens_after_one_that_stays_open():
     assert rig.time_s < PERIOD_S * (channels.REST_ROWS + 3 * channels.PULSE_ROWS + 2)
 
 
+def test_chambers_without_a_sensor_are_stated():
+    lines = DirectRig(SPATIAL).channels().lines
+    assert [line.endswith("; no sensor") for line in lines[:9]] == [False] * 6 + [True] * 3
+    assert lines[9] == "no pressure sensor at channels 6, 7, 8"
+
+
 def test_exchanged_hoses_are_named():
     rig = DirectRig()
     permute(rig.pneumatics, [0, 1, 3, 2, 4, 5])
