@@ -29,7 +29,6 @@ from modsoft.runtime.terminal import say
 
 PRESSURE_SHARE = 0.4  # of the range from p_min_bar to p_max_bar: default pressure of a pulse
 LEAST_SHARE_BAR = 0.05  # set-point with which a reading is compared
-DISAGREES_BAR = 0.05  # of set-point and sensor, as in firmware/limits.h
 
 
 @dataclass(frozen=True)
@@ -174,11 +173,7 @@ def _pressures(sample: Sample) -> str:
     shares = (sample.measured_bar / sample.applied_bar)[sample.applied_bar >= LEAST_SHARE_BAR]
     if scale := channel_faults.wrong_full_scale(list(shares), channel_faults.LEAST_SHARE, channel_faults.MOST_SHARE):
         return scale
-    above_bar = np.nan_to_num(sample.measured_bar - sample.applied_bar)
-    low, high = int(np.argmin(above_bar)), int(np.argmax(above_bar))
-    if above_bar[low] < -DISAGREES_BAR and above_bar[high] > DISAGREES_BAR:
-        return f"the pressure of channel {low} shows at the input A{high}, expected A{low}: exchange the wires"
-    most = low if -above_bar[low] > above_bar[high] else high
+    most = int(np.argmax(np.nan_to_num(np.abs(sample.measured_bar - sample.applied_bar))))
     return (
         f"channel {most} was set to {sample.applied_bar[most]:.2f} bar and its sensor measured "
         f"{sample.measured_bar[most]:.2f}"

@@ -23,8 +23,10 @@ from modsoft.runtime.layout import listed
 from modsoft.runtime.robot import Chamber, Robot, Valve
 
 LEVELS = 5
-LEVEL_ROWS = 6  # at every pressure: the chambers fill in four
-LEVEL_MEAN_ROWS = 2
+LEVEL_ROWS = 10  # at every pressure
+LOWEST_ROWS = 4  # at the smallest pressure after it, before the firmware vents for a sensor that does not agree
+LEVEL_MEAN_ROWS = 3
+CHANNEL_ROWS = LEVELS * (LEVEL_ROWS + LOWEST_ROWS)
 LEAST_SLOPE, MOST_SLOPE = 0.8, 1.25  # of a valve and a sensor without a fault
 LARGEST_OFFSET_BAR = 0.03
 LARGEST_RESIDUAL_BAR = 0.005  # root mean square
@@ -58,21 +60,21 @@ def levels_bar(valve: Valve) -> Array:
 
 
 def schedule(chambers: Sequence[int], sensed: Sequence[int], valve: Valve) -> Array:
-    """Set-points (R, CHANNELS), bar: vented; all chambers at the smallest pressure; then the levels of one channel with
-    a sensor after the other, as in a run that bends one module. chambers, sensed: channels."""
+    """Set-points (R, CHANNELS), bar: vented; then the levels of one channel with a sensor after the other, with all
+    others at the smallest pressure, as in a run that bends one module. chambers, sensed: channels."""
     blocks = [np.zeros((REST_ROWS, CHANNELS))]
     lowest = np.zeros(CHANNELS)
     lowest[list(chambers)] = valve.p_min_bar
     for channel in sensed:
-        block = np.tile(lowest, (LEVEL_ROWS * LEVELS, 1))
-        block[:, channel] = np.repeat(levels_bar(valve), LEVEL_ROWS)
-        blocks.append(block)
-    return np.concatenate([*blocks, np.tile(lowest, (LEVEL_ROWS, 1))])
+        block = np.tile(lowest, (LEVELS, LEVEL_ROWS + LOWEST_ROWS, 1))
+        block[:, :LEVEL_ROWS, channel] = levels_bar(valve)[:, None]
+        blocks.append(block.reshape(-1, CHANNELS))
+    return np.concatenate(blocks)
 
 
 def channel_of_row(sensed: Sequence[int], row: int) -> int | None:
     """The channel whose levels this row belongs to."""
-    number = (row - REST_ROWS) // (LEVEL_ROWS * LEVELS)
+    number = (row - REST_ROWS) // CHANNEL_ROWS
     return None if row < REST_ROWS or number >= len(sensed) else sensed[number]
 
 
@@ -97,8 +99,8 @@ class Watch:
 def fit_of(samples: Sequence[Sample], sensed: Sequence[int], number: int) -> Fit:
     """The line of `sensed[number]` by least squares."""
     channel, vented_bar = sensed[number], mean_of(samples, REST_ROWS - 1).measured_bar
-    ends = REST_ROWS + LEVEL_ROWS * (LEVELS * number + np.arange(1, LEVELS + 1)) - 1
-    means = [mean_of(samples, int(end), LEVEL_MEAN_ROWS) for end in ends]
+    starts = REST_ROWS + CHANNEL_ROWS * number + (LEVEL_ROWS + LOWEST_ROWS) * np.arange(LEVELS)
+    means = [mean_of(samples, int(start) + LEVEL_ROWS - 1, LEVEL_MEAN_ROWS) for start in starts]
     set_bar = np.array([mean.applied_bar[channel] for mean in means])
     measured_bar = np.array([mean.measured_bar for mean in means]) - vented_bar  # (LEVELS, channels)
     slope, intercept_bar = np.polyfit(set_bar, measured_bar[:, channel], 1)
