@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 from log_records import tick_record
 from reference_run import COUNTS, reference_run, slewed, with_output
+from tracker_frames import ROBOT, tracker_frame
 
+from modsoft.hil import rotations
 from modsoft.hil import soak as soaks
 from modsoft.hil.faults import FAULTS
 from modsoft.hil.outputs import read_outputs
 from modsoft.hil.post_fault_checks import InjectedFault, SoakRun, check_fault, check_log, check_valves, check_vent
 from modsoft.runtime.log_reader import Run, read
 from modsoft.runtime.log_record import EndRecord, StartRecord
+from modsoft.runtime.safety import FrameValidator
 
 START = StartRecord(0, np.zeros(12))
 TOOL = Path(__file__).parents[2] / "tools" / "soak.py"
@@ -40,6 +43,16 @@ def test_faults_have_a_row_and_a_required_reaction():
         assert fault.is_transient or fault.codes, f"{fault.name}: no reaction"
         assert re.compile(fault.message)
     assert len([fault for fault in FAULTS if not fault.codes]) >= 5, "for the first third"
+
+
+def test_turned_tool_shows_as_its_fault():
+    fault = next(fault for fault in FAULTS if fault.name == "tool seen turned by 170 degrees")
+    validator, angles = FrameValidator(ROBOT), (10.0, -20.0, 30.0)
+    assert validator.check(tracker_frame(0, 0.0, angles), 0.0).status == "good"
+    poses = tracker_frame(24, 0.4, angles).poses
+    poses[2] = rotations.turned(poses[2].tolist(), [0.0, 0.0, 0.0], 170.0)
+    status = validator.check(tracker_frame(24, 0.4, angles, poses=poses), 0.4).status
+    assert fault.detected([tick_record(1, frame_status=status)], tick_record(0)) is not None, status
 
 
 # ---- A fault

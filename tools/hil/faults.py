@@ -205,7 +205,7 @@ FAULTS = [
         tracker(jump={"tool": 2, "deg": 170.0}),
         tracker(jump=None),
         TRANSIENT_S,
-        held("jump"),
+        held("tools in a wrong order", "jump"),  # the next module is behind the turned tool
     ),
     Fault("tracker frozen briefly", 14, tracker(freeze=True), tracker(freeze=False), SILENCE_S, held(*STALE)),
     Fault("tracker's numbers run back", 19, tracker(back=40), tracker(back=0), SILENCE_S, held(*STALE)),
