@@ -10,6 +10,7 @@ import pytest
 import serial
 
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
+from modsoft.hil.board.stepped_port import SteppedPort
 
 BAUD = 250_000  # of the echo; and of the firmware
 pytestmark = pytest.mark.realtime
@@ -62,6 +63,20 @@ def test_uart_loses_the_bytes_that_the_chip_loses(probe: Path) -> None:
         assert chip.port.read(1) == b""
         chip.port.close()
     assert board.summary["rx_overrun"] == 7
+
+
+@pytest.mark.usefixtures("simavr")
+def test_uart_counts_a_byte_that_is_lost_after_a_gap(probe: Path) -> None:
+    with EmulatedBoard("simavr", firmware=probe, bootloader=False, stepped=True) as board:
+        port = SteppedPort(board, baud=115_200)
+        port.idle(0.2)
+        for data in (b"d0123", b"456"):
+            port.write(data)
+            port.idle(0.001)
+        port.idle(0.02)
+        assert port.read(port.in_waiting).endswith(b"016d")
+        port.close()
+    assert board.summary["rx_overrun"] == 4
 
 
 @pytest.mark.usefixtures("simavr")

@@ -40,6 +40,16 @@ static void rx_store(uint8_t byte) {
   correct_byte_time();
 }
 
+/* The start bit of the next byte, if any. */
+static void begin_byte(avr_cycle_count_t now) {
+  rx_now = pty_next_byte(listening_baud());
+  rx_end = now + (rx_now < 0 ? 0 : pty_byte_ticks());
+  if (rx_now >= 0 && rx_shift >= 0) { /* while the shift register is still full */
+    pty_counters.rx_overrun++;
+    rx_shift = -1;
+  }
+}
+
 /* One byte has arrived; the next begins, if any. simavr buffers 64 bytes, the chip 2 and its shift register. */
 static avr_cycle_count_t on_rx_byte(avr_t *chip, avr_cycle_count_t when, void *param) {
   (void)param;
@@ -50,16 +60,8 @@ static avr_cycle_count_t on_rx_byte(avr_t *chip, avr_cycle_count_t when, void *p
       rx_shift = rx_now;
     }
   }
-  rx_now = pty_next_byte(listening_baud());
-  if (rx_now < 0) {
-    return 0;
-  }
-  rx_end = when + pty_byte_ticks();
-  if (rx_shift >= 0) { /* a new start bit while the shift register is still full */
-    pty_counters.rx_overrun++;
-    rx_shift = -1;
-  }
-  return rx_end;
+  begin_byte(when);
+  return rx_now < 0 ? 0 : rx_end;
 }
 
 static uint8_t on_udr_read(avr_t *chip, avr_io_addr_t address, void *param) {
@@ -112,8 +114,7 @@ void uart_start_byte(void) {
   if (rx_now >= 0) {
     return;
   }
-  rx_now = pty_next_byte(listening_baud());
-  rx_end = avr->cycle + (rx_now < 0 ? 0 : pty_byte_ticks());
+  begin_byte(avr->cycle);
   if (rx_now >= 0) {
     avr_cycle_timer_register(avr, pty_byte_ticks(), on_rx_byte, NULL);
   }
