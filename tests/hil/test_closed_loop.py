@@ -43,7 +43,6 @@ def test_robot_follows_policy_through_firmware_and_valves():
     np.testing.assert_allclose(
         motion.true_configuration[-1], arm.configuration, atol=0.003
     )  # resolution of the valve outputs
-    np.testing.assert_allclose(motion.positions[-1], arm.positions, atol=0.001)
     assert motion.true_configuration.shape == motion.measured.shape == (STEPS + 1, 3, 3)
     assert max(rig.emulated.duties()) == 0.0, "vented at the end"
 

@@ -20,13 +20,11 @@ from modsoft.runtime.statistics import TickStatistics
 
 
 class Motion(NamedTuple):
-    """K control steps of N modules. `true_configuration` and `positions` are those of the simulated robot, `measured`
-    are those of the runtime, NaN without a valid frame."""
+    """K control steps of N modules. Configurations are those at the start of each step, and at the end."""
 
-    true_configuration: Array  # (K + 1, N, 3) at the start of each step, and at the end
-    measured: Array  # (K + 1, N, 3)
+    true_configuration: Array  # (K + 1, N, 3) of the simulated robot
+    measured: Array  # (K + 1, N, 3) by the runtime; NaN without a valid frame
     actuation: Array  # (K, N, A) applied
-    positions: Array  # (K + 1, N, 3) module ends in the frame of the base, m
 
 
 def run(
@@ -41,13 +39,12 @@ def run(
     Raises what ends the loop earlier, and `LostInRun` where the board does not confirm the venting.
     """
     robot, arm = rig.robot, rig.plant.arm
-    true_configuration, positions, ticks = [], [], list[TickRecord]()
+    true_configuration, ticks = list[Array](), list[TickRecord]()
 
     def record(line: Record) -> None:
         if isinstance(line, TickRecord):  # on this clock no time has passed since the step began
             ticks.append(line)
             true_configuration.append(np.array(arm.configuration))
-            positions.append(np.array(arm.positions))
 
     devices = Devices(robot, rig.frames, rig.board, rig.clock, rig.wait, calibration)
     rig.board.arm(robot)
@@ -63,7 +60,6 @@ def run(
         np.array([*true_configuration, arm.configuration]),
         np.array([unknown if each is None else each for each in measured]),
         np.array([tick.actuation for tick in ticks]),
-        np.array([*positions, arm.positions]),
     )
     if not rig.board.vent():
         raise LostInRun("the run on the stepped rig is done, but the board did not confirm the venting")

@@ -42,13 +42,20 @@ RMS_MM = 0.1
 SAMPLES = 256  # poses kept for a delayed device: five seconds at the rig's 50 Hz
 
 
+def _of_byte(crc: int) -> int:
+    for _ in range(8):
+        crc = (crc >> 1) ^ 0xA001 if crc & 1 else crc >> 1
+    return crc
+
+
+CRC_TABLE = [_of_byte(byte) for byte in range(256)]
+
+
 def crc16(data: bytes) -> int:
     """The protocol's checksum: CRC-16 with polynomial 0xA001, reflected, from 0."""
     crc = 0
     for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc >> 1) ^ 0xA001 if crc & 1 else crc >> 1
+        crc = crc >> 8 ^ CRC_TABLE[(crc ^ byte) & 0xFF]
     return crc
 
 

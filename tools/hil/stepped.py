@@ -16,15 +16,17 @@ from types import TracebackType
 import numpy as np
 
 from modsoft.hil.board.emulator import EmulatedBoard
-from modsoft.hil.board.stepped_port import STEP_US, SteppedPort
+from modsoft.hil.board.stepped_port import SteppedPort
 from modsoft.hil.plant import PneumaticArm, ValvesAndArm
 from modsoft.hil.polaris_device import FIRST_HANDLE, FRAME_HZ, Polaris
 from modsoft.hil.rig import SENSED_CHANNELS
+from modsoft.runtime.arrays import Array
 from modsoft.runtime.board.board import Board
 from modsoft.runtime.robot import Robot
 from modsoft.runtime.tracking import tx_reply
 from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 
+STEP_US = 20_000  # of robot, sensors and tracker, as on the rig in real time
 CHECKSUM = 5  # characters at the end of a reply: four digits and a carriage return
 
 
@@ -60,6 +62,20 @@ class SteppedTracker:
         """Does nothing: there is no line."""
 
 
+class Newest(LatestFrame):
+    """Asks the tracker when a frame is needed: most frames are never used."""
+
+    def __init__(self, tracker: SteppedTracker):
+        super().__init__()
+        self._tracker = tracker
+
+    def latest(self) -> TrackerFrame | None:
+        frame = self._tracker.read()
+        if frame is not None:
+            self.put(frame)
+        return super().latest()
+
+
 class SteppedRig:
     """Context manager: the robot hangs at rest, `board` is connected and `frames` holds the newest frame.
 
@@ -76,16 +92,18 @@ class SteppedRig:
         """arm: at rest; board: name of the emulated board; tracker: the fake device on a clock."""
         self.robot, self.plant, self._tracker = robot, ValvesAndArm(robot, arm), tracker
         self.emulated = EmulatedBoard(board, stepped=True)
-        self.frames = LatestFrame()
+        self.frames: LatestFrame
         self.board: Board
         self._exits = contextlib.ExitStack()
 
     def __enter__(self) -> SteppedRig:
         with self._exits as exits:
             exits.enter_context(self.emulated)
-            self._port = SteppedPort(self.emulated, on_step=self._advance)
+            self._duty = self._duties()
+            self._port = SteppedPort(self.emulated, on_step=self._advance, step_us=STEP_US)
             exits.callback(self._port.close)
             self.tracker = SteppedTracker(self._tracker(self.clock), self.robot.modules + 1)
+            self.frames = Newest(self.tracker)
             self._sense()
             self.board = Board(self._port, f"the {self.emulated.board} board", self.clock, threaded=False)
             self._exits = exits.pop_all()
@@ -104,25 +122,25 @@ class SteppedRig:
         """Lets this time pass; returns early when the board is lost."""
         until_s = self.clock() + seconds
         while self.board.lost is None and (left_s := until_s - self.clock()) > 0.0:
-            if left_s > 1e-6 * STEP_US:
-                self.board._io_thread.pump()  # otherwise the board serves its port only while it waits for a reply
-            else:
-                self._port.idle(max(left_s, 1e-6))
+            self._port.step_us = min(STEP_US, max(1, round(left_s * 1e6)))
+            self.board._io_thread.pump()  # otherwise the board serves its port only while it waits for a reply
+        self._port.step_us = STEP_US
 
     def _advance(self, duration_s: float) -> None:
         """Robot, sensors and tracker after a step of the board."""
-        duties = [np.nan if duty is None else duty for duty in self.emulated.driven_duties()]
-        self.plant.advance(np.array(duties), duration_s)
-        if int(self.clock() * FRAME_HZ["polaris"]) > int((self.clock() - duration_s) * FRAME_HZ["polaris"]):
-            self._sense()
+        self.emulated.trace.clear()  # an hour of events would fill the memory
+        before, self._duty = self._duty, self._duties()
+        self.plant.advance(0.5 * (before + self._duty), duration_s)
+        self._sense()
+
+    def _duties(self) -> Array:
+        """Duties (channels,), NaN where the pin floats."""
+        return np.array([np.nan if duty is None else duty for duty in self.emulated.driven_duties()])
 
     def _sense(self) -> None:
-        """A new frame, and the pressures at the board's inputs."""
+        """Poses before the tracker, and pressures at the board's inputs."""
         state = self.plant.state()
         self.tracker.device.take({"poses": state["poses"]})
-        frame = self.tracker.read()
-        if frame is not None:
-            self.frames.put(frame)
         inputs = [
             f"adc {channel} {self.emulated.millivolt(bar)}"
             for channel, bar in state["channel_bar"].items()

@@ -103,13 +103,13 @@ class Fleet:
         self._rigidity = self.parameters.bend_ratios(self._stiffness)
         self._constants = self._with_arrays(damping)
         # Force of a stress of 1 Pa at weight 1.
-        self._section_m2 = self.parameters.actuators.area_ratio * area
+        self.section_m2 = self.parameters.actuators.area_ratio * area
         self._thread_count = threads
         self._threads = ThreadPoolExecutor(threads) if threads > 1 else None
         self._rest = self._settled()
         blocks = -(-count // self.lanes)
         self._state = _aligned((blocks, elements + 1, _ELEMENT, self.lanes))
-        self._drive = _aligned((blocks, modules, len(self._places), 4, self.lanes))
+        self.drive = _aligned((blocks, modules, len(self._places), 4, self.lanes))
         self.reset()
 
     @property
@@ -143,13 +143,13 @@ class Fleet:
     def snapshot(self, indices: Sequence[int] | NDArray[np.integer] | None = None) -> Snapshot:
         """The states of robots `indices` (all by default), from which their motion can continue later."""
         block, lane = np.divmod(np.arange(self.count) if indices is None else np.asarray(indices), self.lanes)
-        return Snapshot(self._state[block, :, :, lane], self._drive[block, :, :, :, lane])
+        return Snapshot(self._state[block, :, :, lane], self.drive[block, :, :, :, lane])
 
     def restore(self, snapshot: Snapshot, indices: Sequence[int] | NDArray[np.integer] | None = None) -> None:
         """Sets robots `indices` (all by default) to the states of `snapshot`, one each, or all to the state of one."""
         block, lane = np.divmod(np.arange(self.count) if indices is None else np.asarray(indices), self.lanes)
         self._state[block, :, :, lane] = snapshot.state
-        self._drive[block, :, :, :, lane] = snapshot.drive
+        self.drive[block, :, :, :, lane] = snapshot.drive
 
     def step(self, actuation: Array, period_s: float | None = None) -> None:
         """One control period (by default that of the parameters) with `actuation` (B, N, A) in [-1, 1]."""
@@ -159,10 +159,12 @@ class Fleet:
             raise ValueError(f"found actuation of shape {actuation.shape}, expected {expected} for this fleet")
         if not (np.abs(actuation) <= 1.0).all():
             raise ValueError(f"found an actuation of {actuation[~(np.abs(actuation) <= 1.0)][0]}, expected [-1, 1]")
-        self._set(self._drive, actuation)
-        self._advance(
-            self._constants, self._state, self._drive, self.parameters.period_s if period_s is None else period_s
-        )
+        self._set(self.drive, actuation)
+        self.advance(self.parameters.period_s if period_s is None else period_s)
+
+    def advance(self, duration_s: float) -> None:
+        """Advances by whole time steps with the forces in `drive`."""
+        self._advance(self._constants, self._state, self.drive, duration_s)
 
     def _with_arrays(self, damping: Damping) -> fleet_kernel.Parameters:
         parameters = fleet_kernel.constants(self.parameters, damping, self.time_step_s)
@@ -176,7 +178,7 @@ class Fleet:
         """Writes the forces of an actuation (eq. 3) and the positions of the actuators into the lanes of `drive`."""
         actuators = self.parameters.actuators
         span = actuators.full_stress_pa - actuators.rest_stress_pa
-        force = self._section_m2 * (actuators.rest_stress_pa + span * self._actuators.activations(actuation))
+        force = self.section_m2 * (actuators.rest_stress_pa + span * self._actuators.activations(actuation))
         # Of actuators anywhere around the section the kernel reads the places from its parameters.
         along = self._places if self._layout.second is not None else np.zeros(len(self._places))
         places = np.broadcast_to(along, (*actuation.shape[:2], len(along)))

@@ -18,8 +18,8 @@ ARRIVES_IN_S = 1.0  # real time
 class SteppedPort:
     """The part of a serial port that `modsoft.runtime.board.board.Board` uses; for `threaded=False, clock=port.clock`.
 
-    A read without data lets 5 ms pass. Written bytes arrive in the next step; bytes that the board sends in a step can
-    be read after it.
+    A read without data lets a step of time pass. Written bytes arrive in the next step; bytes that the board sends in a
+    step can be read after it.
     """
 
     def __init__(
@@ -28,12 +28,13 @@ class SteppedPort:
         name: str = "",
         baud: int = 250_000,
         on_step: Callable[[float], None] = lambda duration_s: None,
+        step_us: int = STEP_US,
     ) -> None:
         """board: started with `stepped`. name: the port's new name, if the board was plugged in again. on_step: called
-        after every step, of 5 ms at most, with its duration in seconds."""
+        after every step with its duration in seconds. step_us: the longest step, of a read without data."""
         self.dtr = True
         self.written: list[tuple[float, bytes]] = []  # (clock, bytes)
-        self._board, self._on_step = board, on_step
+        self._board, self._on_step, self.step_us = board, on_step, step_us
         self._port = serial.Serial(name or board.port, baud, timeout=0, exclusive=True)
         self._from_host, self._taken = board.last_run["from_host"], board.last_run["to_host"]
 
@@ -45,8 +46,8 @@ class SteppedPort:
         """Advances time without reading."""
         left_us = round(seconds * 1e6)
         while left_us > 0:
-            self._step(min(left_us, STEP_US))
-            left_us -= STEP_US
+            self._step(min(left_us, self.step_us))
+            left_us -= self.step_us
 
     @property
     def in_waiting(self) -> int:
@@ -54,7 +55,7 @@ class SteppedPort:
 
     def read(self, size: int = 1) -> bytes:
         if not self.in_waiting:
-            self._step(STEP_US)
+            self._step(self.step_us)
         data = self._port.read(size)
         self._taken += len(data)
         return data
