@@ -102,7 +102,7 @@ def cli(
     calibration.toml and its picture. Run nothing else on the machine meanwhile. An interrupted run leaves its traces
     there and no report; the next run into this folder replaces them.
     """
-    _check_system()
+    check_system()
     from tqdm import tqdm
 
     from modsoft.hil import (
@@ -207,7 +207,7 @@ def _about(rig: Rig, robot_file: str, model: Path, task: str, steps: int | None,
     }
 
 
-def _check_system() -> None:
+def check_system() -> None:
     """`DeviceAbsent` on other systems than Linux: the serial ports are pseudo-terminals, and the board is built with
     Linux's headers."""
     if not sys.platform.startswith("linux") or not all(map(system_module, ("fcntl", "pty", "tty"))):

@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from modsoft.hil.record import Record
 from modsoft.hil.valves import (
@@ -107,11 +108,16 @@ def desired_error(record: Record) -> float:
 
 def measurement_error_deg(record: Record) -> Array:
     """Angle (K, N) between the configuration that the runtime used and the simulated robot's at that frame's time."""
+    return angle_between_deg(record.configuration, true_configuration(record, record.frame_mono_ns))
+
+
+def true_configuration(record: Record, at_ns: NDArray[np.int64]) -> Array:
+    """Configuration (T, N, 3) of the simulated robot at the times (T,), between its states in a straight line."""
     plant, times_ns = record.plant_configuration, record.plant_mono_ns
-    after = np.clip(np.searchsorted(times_ns, record.frame_mono_ns), 1, len(times_ns) - 1)
-    weight = (record.frame_mono_ns - times_ns[after - 1]) / (times_ns[after] - times_ns[after - 1])
+    after = np.clip(np.searchsorted(times_ns, at_ns), 1, len(times_ns) - 1)
+    weight = (at_ns - times_ns[after - 1]) / (times_ns[after] - times_ns[after - 1])
     weight = np.clip(weight, 0.0, 1.0)[:, None, None]
-    return angle_between_deg(record.configuration, (1 - weight) * plant[after - 1] + weight * plant[after])
+    return (1 - weight) * plant[after - 1] + weight * plant[after]
 
 
 def _largest(values: Array) -> float:

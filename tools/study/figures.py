@@ -86,13 +86,13 @@ def estimation(records: Sequence[Record]) -> Figure:
             cells = [cell(of_kind, split=split, module=module) for module in modules]
             if any(cells):
                 bars[split] = (colour, cells)
-        _bars(panel, modules, bars)
+        draw_bars(panel, modules, bars)
         panel.set(title=f"{network}, {data} data", xlabel="module")
     panels[0].set_ylabel("estimation error, %")
     return figure
 
 
-def _bars(panel: Axes, modules: list[int], bars: dict[str, tuple[str, list[Cell | None]]]) -> None:
+def draw_bars(panel: Axes, modules: list[int], bars: dict[str, tuple[str, list[Cell | None]]]) -> None:
     """A group of bars for each module; the thin line above a bar is its standard deviation."""
     width = 0.8 / len(bars)
     for place, (name, (colour, cells)) in enumerate(bars.items()):
@@ -150,7 +150,7 @@ def errors(records: Sequence[Record], folder: Folder, model: Model, modules: int
             cells = [cell(selected, module=module, **of_task) for module in numbers]
             if any(cells):
                 bars[LABELS[name]] = (COLOURS[name], cells)
-        _bars(panels[row, 0], numbers, bars)
+        draw_bars(panels[row, 0], numbers, bars)
         # On a linear axis the bars of the correction would be too small to see.
         panels[row, 0].set(title=f"task {task}", ylabel="configuration error, %", yscale="log", ylim=LOGARITHMIC)
         for correction in CORRECTIONS:

@@ -57,7 +57,8 @@ class Run:
 
 @dataclass(frozen=True)
 class Plan:
-    """data: data sets to collect; mixes: names of the data sets of each mix that models are trained on."""
+    """data: data sets to collect; mixes: names of the data sets of each mix that models are trained on; test_mix: the
+    one whose test part measures the estimation errors of all models, None: each model's own; drive: of the robot."""
 
     data: tuple[Data, ...]
     mixes: dict[str, tuple[str, ...]]
@@ -66,6 +67,8 @@ class Plan:
     oracle_errors: tuple[tuple[str, int], ...]  # task, modules
     settings: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)  # of training, by network and mix
     steps: int | None = None  # of each task; None: all
+    test_mix: str | None = "paper"
+    drive: str = "cables"
 
     @property
     def seeds(self) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 
 from modsoft.runtime.errors import ModelError
 from modsoft.runtime.files import check_not_input, make_folder, read_text, written
@@ -52,25 +53,25 @@ stiffness and payload. None of the data contain the tasks."""
 def write(folder: Folder) -> None:
     """Writes report.md; `ModelError` if there are no results."""
     check_not_input(folder.report, folder.results, folder.notes)
-    text = "\n".join(lines(results.load(folder.results), _notes(folder))) + "\n"
+    text = "\n".join(lines(results.load(folder.results), notes_of(folder))) + "\n"
     with written(folder.report) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def publish(study: Folder, to: Folder) -> None:
-    """Copies the results and figures of a study, without its data, models and runs."""
+def publish(study: Folder, to: Folder, names: Iterable[str] = figures.CAPTIONS) -> None:
+    """Copies the results and the figures of these names of a study, without its data, models and runs."""
     results.load(study.results)
     make_folder(to.figures)
-    pictures = [study.figures / f"{name}.png" for name in figures.CAPTIONS]
+    pictures = [study.figures / f"{name}.png" for name in names]
     missing = [picture.name for picture in pictures if not picture.is_file()]
     if missing:
-        raise ModelError(f"{study.figures}: no {', '.join(missing)}; modsoft-evaluate study --only figures draws them")
+        raise ModelError(f"{study.figures}: no {', '.join(missing)}; --only figures draws them")
     for source, copy in [(study.results, to.results), *((each, to.figures / each.name) for each in pictures)]:
         with written(copy) as temporary:
             shutil.copyfile(source, temporary)
 
 
-def _notes(folder: Folder) -> str:
+def notes_of(folder: Folder) -> str:
     return read_text(folder.notes).strip() if folder.notes.is_file() else ""
 
 
@@ -107,11 +108,11 @@ def lines(stored: Results, notes: str) -> list[str]:
         text += [f"![{caption}](figures/{name}.png)", "", f"*{caption}*", ""]
         if name == figures.WORKSPACE:
             text += [*tables.covered(records)]
-    text += ["## Data", "", DATA, "", *_data_sets(about)]
-    return [*text, "## Models", "", *_models(about)]
+    text += ["## Data", "", DATA, "", *data_sets(about)]
+    return [*text, "## Models", "", *models(about)]
 
 
-def _data_sets(about: About) -> list[str]:
+def data_sets(about: About) -> list[str]:
     rows = []
     for each in about.data:
         mixes = ", ".join(mix for mix, names in about.mixes.items() if each.name in names)
@@ -119,7 +120,7 @@ def _data_sets(about: About) -> list[str]:
     return table(["data set", "part of", "strategy", "samples", "steps of an episode", "seed"], rows)
 
 
-def _models(about: About) -> list[str]:
+def models(about: About) -> list[str]:
     rows = []
     for each in about.models:
         settings = each.settings

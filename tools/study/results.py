@@ -13,12 +13,14 @@ from modsoft.runtime.files import read_text
 
 ESTIMATION = "actuation estimation error"
 CONTROL = "configuration error"
+ANGLE = "bending angle error"
 TIP_DISTANCE = "distance of the tip from the axis"
 TIP_TILT = "tilt of the tip"
 COVERED = "volume covered by the module's end"
 UNITS = {
     ESTIMATION: "% of the actuation range",
     CONTROL: "% of the unit vector's length",
+    ANGLE: "degrees",
     TIP_DISTANCE: "% of the robot's length",
     TIP_TILT: "degrees",
     COVERED: "cm³",
@@ -32,15 +34,17 @@ class Record(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, frozen=Tr
     `mean` and `std` are over the control steps of a task or the windows of a test part, for one module and one seed.
     """
 
-    table: Literal["1", "2", "3", "modules", "robustness", "end-effector", "coverage"]  # 1 to 3: as in the paper
+    # 1 to 4: as in the paper; estimation: of section 3.3
+    table: Literal["1", "2", "3", "4", "estimation", "modules", "robustness", "end-effector", "coverage"]
     quantity: str  # what mean and std are of, a key of UNITS
     unit: str  # of mean and std
-    source: Literal["study", "paper", "oracle"]  # oracle: the smallest error found by optimising the actions
+    # oracle: the smallest error found by optimising the actions; the rigs: stepped, or in real time
+    source: Literal["study", "paper", "oracle", "stepped rig", "real-time rig"]
     network: str | None = None  # bilstm, lstm, module-lstm (one LSTM for each module)
     data: str | None = None  # the mix of data sets that the network was trained on; in coverage the data set
     split: str | None = None  # of the windows into training and test part: blocks, shuffled
-    seed: int | None = None  # of the training
-    task: str | None = None  # A, B, C
+    seed: int | None = None  # of the training; of a run on the rig its number, from 0
+    task: str | None = None  # A, B, C; edge, down
     modules: int  # of the robot
     module: int | None = None  # 1 at the base
     correction: str | None = None  # none, integral

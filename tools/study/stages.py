@@ -73,7 +73,7 @@ def settings_of(plan: Plan, model: Model) -> Settings:
     of_plan = plan.settings.get((model.network, model.data), {})
     of_model = {"network": model.network, "split": model.split, "seed": model.seed}
     precision = {"precision": fastest_precision()}
-    return Settings(**BY_DRIVE["cables"] | of_model | precision | of_plan)
+    return Settings(**BY_DRIVE[plan.drive] | of_model | precision | of_plan)
 
 
 def _train(plan: Plan, folder: Folder, model: Model, add_progress: AddProgress) -> None:
@@ -116,8 +116,8 @@ def onnx_sha256(folder: Folder, model: Model) -> str:
 def estimate_stage(plan: Plan, folder: Folder, jobs: int) -> Stage:
     """estimates/*.npz: the errors of Table 1.
 
-    All models are tested on the test part of the paper's data, so that they can be compared. Models trained on these
-    data did not see that part in training.
+    All models are tested on the test part of the same data, the plan's `test_mix`, so that they can be compared. Models
+    trained on these data did not see that part in training.
     """
     missing = [each for each in plan.models if _outdated(folder.estimate(each), folder.checkpoint(each))]
     return Stage("estimate", missing, partial(_estimate, plan, folder), lambda model: ESTIMATE_S)
@@ -126,9 +126,10 @@ def estimate_stage(plan: Plan, folder: Folder, jobs: int) -> Stage:
 def _estimate(plan: Plan, folder: Folder, model: Model, add_progress: AddProgress) -> None:
     checkpoint = checkpoints.load(folder.checkpoint(model))
     provenance: dict[str, Any] = checkpoint["provenance"]
-    (name,) = plan.mixes["paper"]
+    mix = plan.test_mix or model.data
+    (name,) = plan.mixes[mix]
     data = dataset.read(folder.data(name))
-    if model.data == "paper" and provenance["data_sha256"] != data.sha256():
+    if model.data == mix and provenance["data_sha256"] != data.sha256():
         raise ModelError(f"{folder.checkpoint(model)}: trained on other data than {folder.data(name)}; delete one")
     _, _, test = dataset.split(data, checkpoint["network"]["history"], model.split, model.seed)
     errors = fit.estimation_errors(checkpoints.network_of(checkpoint), test).numpy()
