@@ -21,7 +21,13 @@ needs_fleet = pytest.mark.skipif(not fleet_kernel.variants(), reason="the fleet'
 
 @pytest.mark.parametrize(
     ("file", "robot"),
-    [("pneumatic-3", "pneumatic-3"), ("pneumatic-3", "pneumatic-2"), ("cable-4", "cable-4"), ("cable-4", "cable-6")],
+    [
+        ("pneumatic-3", "pneumatic-3"),
+        ("pneumatic-3", "pneumatic-2"),
+        ("pneumatic-3x3", "pneumatic-3x3"),
+        ("cable-4", "cable-4"),
+        ("cable-4", "cable-6"),
+    ],
 )
 def test_shipped_model_fits_its_robots_and_has_its_provenance(file, robot):
     controller = Model.load(MODELS / f"{file}.onnx")
@@ -34,7 +40,12 @@ def test_shipped_model_fits_its_robots_and_has_its_provenance(file, robot):
 @needs_fleet
 @pytest.mark.parametrize(
     ("file", "robot", "task", "limit"),
-    [("pneumatic-3", "pneumatic-3", "down", 1.0), ("cable-4", "cable-4", "A", 2.0), ("cable-4", "cable-6", "A", 8.0)],
+    [
+        ("pneumatic-3", "pneumatic-3", "down", 1.0),
+        ("pneumatic-3x3", "pneumatic-3x3", "circle", 4.0),
+        ("cable-4", "cable-4", "A", 2.0),
+        ("cable-4", "cable-6", "A", 8.0),
+    ],
 )
 def test_shipped_model_controls_its_robot(file, robot, task, limit):
     """limit: of the mean error of each module over the first 60 steps, degrees or percent; far above the measured error

@@ -16,5 +16,5 @@ def test_every_model_task_and_correction_is_measured(tmp_path):
     output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     result = json.loads((tmp_path / "models.json").read_text())
     assert result["about"]["quick"] is True
-    assert len(result["rows"]) == len(output.splitlines()) - 2 == 2 * 2 * 2 + 2 * 3 * 2
+    assert len(result["rows"]) == len(output.splitlines()) - 2 == 2 * 2 * 2 + 2 + 2 * 3 * 2
     assert all(0.0 <= value < 100.0 for row in result["rows"] for value in row["error"])
