@@ -5,7 +5,7 @@ import pytest
 from bending_arm import BendingArm
 from rigid_arm import RigidArm
 
-from modsoft.hil import closed_loop
+from modsoft.hil import closed_loop, stepped
 from modsoft.hil.polaris_device import Polaris
 from modsoft.hil.stepped import SteppedRig
 from modsoft.runtime import robot as robot_file
@@ -85,3 +85,9 @@ def test_three_chambers_a_module_are_driven_through_firmware_and_valves():
     reached.advance(0.0)
     np.testing.assert_allclose(motion.true_configuration[-1], reached.configuration, atol=0.003)
     assert np.max(angle_between_deg(motion.measured[-1], reached.configuration)) < 0.3
+
+
+def test_events_of_a_long_run_do_not_fill_the_memory(monkeypatch):
+    monkeypatch.setattr(stepped, "MOST_EVENTS", 50)
+    _, rig = control()
+    assert len(rig.emulated.trace) < 150  # those of one step may follow

@@ -26,6 +26,7 @@ from modsoft.runtime.robot import Robot
 from modsoft.runtime.tracking import tx_reply
 from modsoft.runtime.tracking.frame import LatestFrame, TrackerFrame
 
+MOST_EVENTS = 100_000  # of the board that are kept: those of a collection would fill the memory
 STEP_US = 20_000  # of robot, sensors and tracker, as on the rig in real time
 CHECKSUM = 5  # characters at the end of a reply: four digits and a carriage return
 
@@ -128,7 +129,8 @@ class SteppedRig:
 
     def _advance(self, duration_s: float) -> None:
         """Robot, sensors and tracker after a step of the board."""
-        self.emulated.trace.clear()  # an hour of events would fill the memory
+        if len(self.emulated.trace) > MOST_EVENTS:
+            self.emulated.trace.clear()
         before, self._duty = self._duty, self._duties()
         self.plant.advance(0.5 * (before + self._duty), duration_s)
         self._sense()
