@@ -55,6 +55,19 @@ def test_written_bytes_arrive_in_the_next_step(board_name: str) -> None:
     assert board.summary["rx"] == 200
 
 
+def test_bytes_have_the_baud_rate_that_was_set_before_them() -> None:
+    with EmulatedBoard("native", stepped=True) as board:
+        port = SteppedPort(board)
+        port.idle(1.0)
+        for _ in range(4):
+            for baud in (115_200, 250_000):
+                port._port.baudrate = baud
+                port.write(b"\x01")
+                port.idle(0.0005)
+        port.close()
+    assert board.summary["wrong_baud"] == 4
+
+
 @pytest.mark.usefixtures("simavr")
 def test_no_byte_is_lost_at_the_rate_of_the_line() -> None:
     """Each frame is answered, so the firmware receives and sends at once. 63 bytes have room in its receive buffer."""

@@ -138,7 +138,7 @@ void pty_poll(void) {
     events_emit("uart-open", "\"baud\":%u", host_baud);
     board_reset_pin();
   }
-  if (host_open && board_now() >= next_baud_poll) {
+  if (host_open && (port.revents & POLLIN || board_now() >= next_baud_poll)) { /* bytes have the rate of their host */
     poll_baud();
     next_baud_poll = board_now() + 1000 * TICKS_PER_US;
   }
