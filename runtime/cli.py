@@ -30,6 +30,7 @@ def _check_robot(name: str) -> None:
 
     robot, folder = robot_file.load(name), robot_file.folder_of(name)
     task, steps = task_of(robot, folder), 0
+    calibration = "" if robot.valve is None else _calibration(name)
     if task:
         try:
             steps = len(load_task(task, robot))
@@ -44,12 +45,26 @@ def _check_robot(name: str) -> None:
             f"valves: {valve.model}, full scale {valve.full_scale_bar:g} bar, {valve.p_min_bar:g} to "
             f"{valve.p_max_bar:g} bar; is full_scale_bar what the label says?"
         )
+        click.echo(calibration)
     for chamber in robot.chambers:
         click.echo(f"module {chamber.module}, chamber at {chamber.direction_deg:g} degrees: channel {chamber.channel}")
     open_ends = _open_ends(robot, folder)
     if open_ends:
         click.echo(f"still to fill in before a run: {'; '.join(open_ends)}")
     click.echo("ok")
+
+
+def _calibration(name: str) -> str:
+    """The calibration beside a robot file, in words. Raises `ModelError` for a damaged one."""
+    from modsoft.runtime.calibration import file
+
+    path = file.path_for(name)
+    if not path.is_file():
+        return "no calibration of the tools; modsoft-calibrate rest writes one"
+    calibration = file.read(path)
+    return (
+        f"calibration {path} of {calibration.date[:10]}: robot {calibration.robot}, {len(calibration.modules)} modules"
+    )
 
 
 def _open_ends(robot: robot_file.Robot, beside: Path) -> list[str]:

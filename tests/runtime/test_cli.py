@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tools_at_rest import calibrated
 
 from modsoft.runtime import robot as robot_file
+from modsoft.runtime.calibration import file
 from modsoft.runtime.tracking.sources import port_of
 
 SCRIPT = Path(sys.executable).with_name("modsoft-runtime")
@@ -101,6 +103,18 @@ def test_check_names_missing_settings(tmp_path):
     path.write_text(text.replace('"polaris"', '"aurora"'))
     assert "still to fill in" not in run("--check", path).stdout
     assert "still to fill in" not in run("--check", "cable-4").stdout
+
+
+def test_check_names_the_calibration(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(robot_file.text_of("pneumatic-3"))
+    assert "no calibration of the tools; modsoft-calibrate rest writes one" in run("--check", path).stdout.splitlines()
+    calibration, _ = calibrated()
+    file.write(tmp_path / "robot.calibration.toml", calibration)
+    line = f"calibration {tmp_path / 'robot.calibration.toml'} of 2026-11-28: robot arm, 3 modules"
+    assert line in run("--check", path).stdout.splitlines()
+    (tmp_path / "robot.calibration.toml").write_text("schema = 1")
+    assert "robot at the top of the file is missing" in refused(65, "--check", path)
 
 
 @pytest.mark.parametrize(("task", "expected"), [("up", "edge, down"), ("none.npy", "no task file")])
