@@ -7,8 +7,8 @@
 #include <immintrin.h>
 #endif
 
-/* Actuators that act on a module at a time: two along the directors, or as many as `struct parameters` says, anywhere around
- * the section. */
+/* Actuators that act on a module at a time: two along the directors, or as many as `struct parameters` says, anywhere
+ * around the section. */
 enum { ACTUATORS = 2, ANYWHERE = 2, MOST_ACTUATORS = 12 };
 
 /* The modules of a robot; three arrays hold the differences between its elements. fleet.py fills it in, field by field.
