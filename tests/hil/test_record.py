@@ -88,3 +88,11 @@ def test_reports_of_a_real_board_take_the_place_of_registers(run_folder, tmp_pat
     (tmp_path / "board.jsonl").write_text(json.dumps(serial) + "\n")
     silent = record.read(tmp_path, tmp_path, robot_file.load("pneumatic-3"), "down", np.zeros((2, 3, 3)), 79)
     assert criteria.assess(silent).outcome == "failed"
+
+
+def test_simulated_robot_has_the_chambers_of_the_robot_file():
+    robot = robot_file.load("pneumatic-3x3")
+    bar = np.arange(9.0).reshape(3, 3) / 10
+    state = {"mono_ns": 5, "late_ms": 0.1, "configuration": [[0.0, 0.0, 1.0]] * 3, "pressure_bar": bar.tolist()}
+    columns = record._plant([state, state], robot, 0.0, 10)
+    np.testing.assert_array_equal(columns["plant_bar"], [bar, bar])

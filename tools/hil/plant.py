@@ -54,7 +54,7 @@ class PneumaticArm(Protocol):
     @property
     def directors(self) -> Array: ...  # (N, 3, 3), rows d1, d2, d3
     @property
-    def pressures(self) -> Array: ...  # (N, 2), bar, in the chambers
+    def pressures(self) -> Array: ...  # (N, n), bar, in the chambers
     def set_pressures(self, bar: Array) -> None: ...
     def advance(self, duration_s: float) -> None: ...
 
@@ -127,7 +127,7 @@ class ValvesAndArm:
         return {each: self.pneumatics.sensor_bar(each, self._outlets_bar, chambers_bar) for each in channels}
 
     def state(self) -> dict[str, Any]:
-        """Plain values: time_s simulated, configuration (N, 3), pressure_bar (N, 2), channel_bar {channel: bar},
+        """Plain values: time_s simulated, configuration (N, 3), pressure_bar (N, n), channel_bar {channel: bar},
         poses (N + 1, 4, 4) for the tracker."""
         return {
             "t_s": round(self.time_s, 6),

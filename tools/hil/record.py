@@ -61,7 +61,7 @@ class Record:
     board_summary: dict[str, Any]
     plant_mono_ns: NDArray[np.int64]  # (M,)
     plant_configuration: Array  # (M, N, 3)
-    plant_bar: Array  # (M, N, 2)
+    plant_bar: Array  # (M, N, n) of n chambers
     plant_late_ms: Array  # of the slices in the run
     # A real board shows no registers: `outputs` are the applied pressures of its STATUS, of at most this age.
     sees_registers: bool = True
@@ -133,7 +133,7 @@ def read(
         board_dropped_bytes=summary.get("rx_overrun", math.nan),
         **_board_lateness(events, summary, start_ns, end_ns),
         board_summary=summary,
-        **_plant(plant, modules, start_ns, end_ns),
+        **_plant(plant, robot, start_ns, end_ns),
     )
 
 
@@ -176,13 +176,14 @@ def _board_lateness(events: list[Line], summary: Line, start_ns: float, end_ns: 
     }
 
 
-def _plant(states: list[Line], modules: int, start_ns: float, end_ns: int) -> Line:
+def _plant(states: list[Line], robot: Robot, start_ns: float, end_ns: int) -> Line:
     """The columns of the simulated robot; its lateness is that of the slices in the run."""
+    modules, chambers = robot.modules, len(robot.directions)
     late = [state["late_ms"] for state in states if start_ns <= state["mono_ns"] <= end_ns]
     return {
         "plant_mono_ns": _column(states, "mono_ns", np.int64),
         "plant_configuration": _column(states, "configuration").reshape(len(states), modules, 3),
-        "plant_bar": _column(states, "pressure_bar").reshape(len(states), modules, 2),
+        "plant_bar": _column(states, "pressure_bar").reshape(len(states), modules, chambers),
         "plant_late_ms": np.array(late),
     }
 
