@@ -105,7 +105,9 @@ FAULTS = {
     "blocked hose": Fault(57, lambda rig: rig.pneumatics.blocked.add(2), "channel 2: "),
     "leak": Fault(57, lambda rig: rig.pneumatics.leaks.update({4: 0.5}), "the sensor of channel 4", True, (True,)),
     "leak, no sensor": Fault(57, lambda rig: rig.pneumatics.leaks.update({4: 0.5}), "channel 4 bends", True, (False,)),
-    "large leak": Fault(57, lambda rig: rig.pneumatics.leaks.update({0: 0.75}), "channel 0: no module moves"),
+    "leak of nearly all air": Fault(
+        57, lambda rig: rig.pneumatics.leaks.update({0: 0.9}), "channel 0: no module moves"
+    ),
     "valve always open": Fault(57, lambda rig: rig.pneumatics.stuck_bar.update({2: 0.1}), "channel 2: no module moves"),
     "valve stays open": Fault(57, stays_open, "channel 2: "),
     "no air": Fault(57, lambda rig: setattr(rig.pneumatics, "has_supply", False), "no channel bends a module"),
