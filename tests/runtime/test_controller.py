@@ -131,3 +131,9 @@ def test_sequence_holds_without_a_frame_and_goes_on_meanwhile():
     sequence.skip()
     assert sequence.applied[0, 0] == 0.1
     assert sequence.compute(REST, NEXT, NEXT)[0, 0] == 0.4
+
+
+def test_sequence_has_nothing_to_prepare():
+    sequence = Sequence(ROBOT, np.full((1, 3, 1), 0.1))
+    assert sequence.preview(REST) is sequence.applied
+    assert (sequence.target, sequence.raw) == (None, None)

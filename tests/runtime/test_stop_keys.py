@@ -208,18 +208,24 @@ def test_pause_key_requests_a_pause_and_a_stop_key_after_it_the_end(terminal):
         keyboard.write(b"p")
         stop.wait(10)
         assert isinstance(stop.error, Paused)
+        assert (str(stop.error), stop.error.exit_code) == ("paused", 0)
         keyboard.write(b"q")
         keys._thread.join(10)
     assert isinstance(stop.error, StopKey)
 
 
-def test_pause_key_is_another_key_where_nothing_can_pause(terminal):
+@pytest.mark.parametrize(("pausable", "typed"), [(False, b"p"), (True, b"x")])
+def test_other_keys_do_not_pause(terminal, pausable, typed):
     keyboard, _ = terminal
     stop = Stop()
-    with Keys(stop) as keys:
-        keyboard.write(b"pq")
-        keys._thread.join(10)
-    assert isinstance(stop.error, StopKey)
+    with Keys(stop, *[True] * pausable) as keys:  # by default nothing can pause
+        keyboard.write(typed)
+        stop.wait(0.2)
+        assert stop.error is None
+        assert keys._thread.is_alive()
+
+
+def test_pause_does_not_replace_another_request():
     stop = Stop()
     stop.request(StopKey("stop key pressed"))
     stop.request(Paused("paused"))
