@@ -1,6 +1,7 @@
 """Samples from the records of a run: which steps are recorded, and which are gaps."""
 
 import json
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from modsoft.runtime import robot as robot_file
 from modsoft.runtime.board.protocol import CHANNELS
 from modsoft.runtime.control.actuation import channel_pressures_bar
 from modsoft.runtime.errors import ModelError
+from modsoft.runtime.log import RunLog
 from modsoft.runtime.log_record import BoardRecord, DoneRecord, FrameRecord
 from modsoft.training.data.recording import Plan, Runs, Samples, of_data
 
@@ -129,6 +131,20 @@ def test_folder_of_another_command_is_refused(tmp_path):
     (folder / "meta.json").write_text(json.dumps({"task": "down"}))
     with pytest.raises(ModelError, match="not of a run of modsoft-collect"):
         runs.read()
+
+
+def test_times_of_a_real_robot_are_those_of_the_wall_clock(tmp_path):
+    runs = Runs(tmp_path / "d.h5.runs", ROBOT)
+    runs.make({"seed": 1})
+    log = RunLog(runs.folder, "arm", "", {"collection": {name: getattr(PLAN, name) for name in PLAN.__struct_fields__}})
+    for tick in range(2, 6):
+        log.put(record(tick, wall=f"2026-01-02T03:04:0{tick}.500+00:00"))
+    log.close(0, "done", {})
+    [real], [emulated] = list(runs.episodes("real")), list(runs.episodes("emulated"))
+    start_s = datetime(2026, 1, 2, 3, 4, 2, 500_000, UTC).timestamp()
+    np.testing.assert_allclose(real.time_s[:4] - start_s, [0.0, 0.4, 0.8, 1.2], atol=1e-6)
+    np.testing.assert_allclose(emulated.time_s[:4], [0.8, 1.2, 1.6, 2.0], atol=1e-6)
+    assert np.isnan(real.time_s[4])
 
 
 def test_folder_that_is_a_file_is_refused(tmp_path):
