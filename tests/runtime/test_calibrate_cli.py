@@ -7,9 +7,8 @@ import threading
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tools_at_rest import ERRORS, Tracker, straight
+from tools_at_rest import ERRORS, Tracker, straight, write_tool_files
 
-from modsoft.hil.polaris import write_tool_files
 from modsoft.hil.tool_errors import ToolErrors
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.calibration import commands, file

@@ -30,6 +30,14 @@ def bent_poses(vectors_deg):
     return np.array(poses)
 
 
+def write_tool_files(folder, tools):
+    """Tool definition files for this many tools, base first."""
+    paths = [folder / ("base.rom" if tool == 0 else f"module-{tool}.rom") for tool in range(tools)]
+    for path in paths:
+        path.write_bytes(path.name.encode())
+    return paths
+
+
 def straight(modules=3):
     return np.zeros((modules, 3))
 
