@@ -129,8 +129,8 @@ def _modules(context: click.Context, parameter: click.Parameter, value: str) -> 
     "--task",
     default="",
     metavar="NAME|FILE",
-    help="edge, down, or a .npy file of desired configurations (steps, modules, 3). [default: task under "
-    "[loop] in the robot file, where every path starts from that file's folder]",
+    help="edge, down, circle, A, B, C, or a .npy file of desired configurations (steps, modules, 3). [default: task "
+    "under [loop] in the robot file, where every path starts from that file's folder]",
 )
 @click.option("--steps", type=click.IntRange(1), metavar="N", help="Stop after the first N control steps.")
 @click.option(
