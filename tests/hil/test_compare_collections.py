@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from modsoft.hil import compare_collections
 from modsoft.hil.compare_collections import compare, run
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime.control.features import from_angles_deg
+from modsoft.runtime.errors import LostInRun
 from modsoft.training.data.dataset import DataSet
 
 GENERATION = {"robot": robot_file.load("pneumatic-3").to_dict(), "strategy": "staged", "source": "rig"}
@@ -54,3 +56,32 @@ def test_other_actions_do_not_agree():
 def test_collection_in_real_time_agrees_with_the_stepped_one(tmp_path):
     comparison = run("pneumatic-3", tmp_path, samples=8, steps=8)
     assert comparison.agrees, comparison
+
+
+def test_robot_behind_real_time_is_not_compared(tmp_path, monkeypatch):
+    class Late:
+        """A rig on a computer that is too busy."""
+
+        plant_states = ({"late_ms": 3.0}, {"late_ms": 168_000.0})
+
+        def __init__(self, *arguments):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            pass
+
+        def collect(self, *arguments):
+            pass
+
+        def wait(self, timeout_s):
+            return 0
+
+    monkeypatch.setattr(compare_collections, "Rig", Late)
+    with pytest.raises(
+        LostInRun, match="the simulated robot was 168000 ms behind real time, expected at most 100: this"
+    ):
+        run("pneumatic-3", tmp_path, samples=8, steps=8)
+    assert list(tmp_path.iterdir()) == []

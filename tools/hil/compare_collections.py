@@ -26,6 +26,7 @@ from modsoft.training.data.recording import Plan, Runs
 LARGEST_MEAN_DEG, LARGEST_P99_DEG = 0.1, 1.0
 DEVICE_CODES = (DeviceAbsent.exit_code, LostInRun.exit_code)
 MOST_STARTS = 50  # in real time: a busy computer loses a device, and the same command continues
+MOST_LATE_MS = 100.0  # the simulated robot behind real time: a quarter of a period
 START_S = 120.0  # for processes and devices to start, and to end
 
 
@@ -79,6 +80,12 @@ def run(robot_name: str, folder: Path, samples: int, steps: int, board: str = "a
             code, starts = rig.wait(2 * seconds + START_S), starts + 1
         if code != 0:
             raise LostInRun(f"modsoft-collect ended with {code} after {starts} starts: {rig.last_message()}")
+        late_ms = max(state["late_ms"] for state in rig.plant_states)
+    if late_ms > MOST_LATE_MS:
+        raise LostInRun(
+            f"the simulated robot was {late_ms:.0f} ms behind real time, expected at most {MOST_LATE_MS:g}: this "
+            "computer is too busy, and nothing is compared; close other programs, start again in another folder"
+        )
     episodes = Runs(real.with_name(f"{real.name}.runs"), robot).read().next_episode
     collect_on_rig(robot, stepped, episodes * steps, steps=steps)
     return compare(dataset.read(real), dataset.read(stepped), starts)
