@@ -270,12 +270,12 @@ def check_rest(configuration: Array, poses: Array) -> None:
         )
 
 
-def _out_of_plane(configuration: Array) -> str:
-    """Which module of a planar robot is out of its plane, and how far; empty if none is."""
+def _out_of_plane(configuration: Array) -> str | None:
+    """Which module of a planar robot is out of its plane, and how far; None if none is."""
     outside_deg = out_of_plane_deg(configuration)
     worst = int(np.argmax(outside_deg))
     if not outside_deg[worst] > OUT_OF_PLANE_LIMIT_DEG:
-        return ""
+        return None
     return (
         f"module {worst + 1} by {outside_deg[worst]:.0f} degrees, at most {OUT_OF_PLANE_LIMIT_DEG:g}; the modules bend "
         "in the x-z plane of the tools"

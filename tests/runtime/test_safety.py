@@ -9,7 +9,7 @@ from virtual_loop import PERIOD_S, ROBOT, planar_poses
 
 from modsoft.runtime import robot as robot_file
 from modsoft.runtime import safety
-from modsoft.runtime.control.features import bending_angle_deg
+from modsoft.runtime.control.features import bending_angle_deg, from_poses, out_of_plane_deg
 from modsoft.runtime.errors import LostInRun, ModelError, Tripped
 from modsoft.runtime.safety import FaultCounter, FrameCheck, FrameValidator, check_actuation, check_rest
 from modsoft.runtime.tracking.frame import TrackerFrame
@@ -137,6 +137,15 @@ def test_motion_out_of_the_plane_is_limited():
     check = FrameValidator(ROBOT).check(frame(1, 100.0, poses=tilted_sideways(-35.5)), 100.01)
     assert (check.status, check.detail[:40]) == (safety.OUT_OF_PLANE, "module 2 by 36 degrees, at most 35; the ")
     assert FrameValidator(in_space()).check(frame(1, 100.0, poses=tilted_sideways(80.0)), 100.01).good
+
+
+def test_angle_at_the_limit_of_the_plane_is_accepted(monkeypatch):
+    poses = tilted_sideways(20.0)
+    limit_deg = out_of_plane_deg(from_poses(poses)).max()
+    monkeypatch.setattr(safety, "OUT_OF_PLANE_LIMIT_DEG", limit_deg)
+    assert FrameValidator(ROBOT).check(frame(1, 100.0, poses=poses), 100.01).good
+    monkeypatch.setattr(safety, "OUT_OF_PLANE_LIMIT_DEG", np.nextafter(limit_deg, 0.0))
+    assert FrameValidator(ROBOT).check(frame(1, 100.0, poses=poses), 100.01).status == safety.OUT_OF_PLANE
 
 
 def test_limits_of_status_and_rms_are_those_of_the_robot_file():
