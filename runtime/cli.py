@@ -194,7 +194,8 @@ def _modules(context: click.Context, parameter: click.Parameter, value: str) -> 
 @click.option(
     "--print-robot",
     metavar="NAME",
-    help="Print a shipped robot's file to start your own from, and leave: cable-4, cable-6, pneumatic-2, pneumatic-3.",
+    help="Print a shipped robot's file to start your own from, and leave: cable-4, cable-6, pneumatic-2, pneumatic-3, "
+    "pneumatic-3x3.",
 )
 @click.version_option(None, "-V", "--version", package_name="modsoft", prog_name="modsoft-runtime")
 def cli(**options: Any) -> None:

@@ -85,8 +85,9 @@ def task(name: str, motion: str, modules: int) -> Array:
     unknown name."""
     if name not in available(motion, modules):
         names = "".join(f"{each}, " for each in available(motion, modules))
+        names += "or " if names else ""
         raise UsageError(
-            f"no task {name!r} for a {motion} robot of {modules} modules; expected {names}or a .npy file with "
+            f"no task {name!r} for a {motion} robot of {modules} modules; expected {names}a .npy file with "
             f"desired configurations (steps, {modules}, 3), [v_x, v_y, v_z]"
         )
     match name:

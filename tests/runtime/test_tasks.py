@@ -105,6 +105,11 @@ def test_unknown_task_is_refused_with_the_names():
         tasks.load_task("sideways", robot_file.load("pneumatic-3"))
 
 
+def test_unknown_task_of_a_robot_without_named_tasks_is_refused():
+    with pytest.raises(UsageError, match=r"planar robot of 4 modules; expected a \.npy file"):
+        tasks.task("down", "planar", 4)
+
+
 def test_task_is_loaded_from_a_file(tmp_path):
     path = tmp_path / "task.npy"
     np.save(path, tasks.task("edge", "planar", 2))
