@@ -159,8 +159,8 @@ class FrameValidator:
         off = [abs(math.hypot(*tangent) - 1.0) for tangent in configuration.tolist()]
         if not all(each <= SIZE_TOLERANCE for each in off):  # nor where numbers too large give none
             return DISTORTED, _tool_name(int(np.argmax(off)) + 1), None
-        if self.robot.motion == "planar" and (detail := _out_of_plane(configuration)):
-            return OUT_OF_PLANE, detail, None
+        if self.robot.motion == "planar" and (outside := _out_of_plane(configuration)):
+            return OUT_OF_PLANE, outside, None
         if self._rest_mm is not None:
             pairs = zip(_lengths_mm(poses), self._rest_mm, strict=True)
             over = [length - (STRETCH * rest + STRETCH_MM) for length, rest in pairs]
