@@ -79,7 +79,7 @@ def check_writable(path: Path) -> None:
         where = target.name if target == path else name
         raise UsageError(f"no folder {target.parent} for {where}; make it first")
     if not os.access(target.parent, os.W_OK | os.X_OK):
-        raise OutputError(f"{name}: not written, the folder {target.parent} is read-only; choose another --out")
+        raise OutputError(f"{name}: not written, the folder {target.parent} is read-only; choose another file")
 
 
 def check_not_input(out: Path, *inputs: Path) -> None:
@@ -120,7 +120,7 @@ def written(path: Path, through_links: bool = True) -> Iterator[Path]:
         # Windows refuses to replace a file that is open.
         advice = "close what has it open" if isinstance(error, PermissionError) else "make room"
         raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}); {advice} or choose another --out"
+            f"{path}: cannot be written ({error.strerror or error}); {advice} or choose another file"
         ) from error
     finally:
         with contextlib.suppress(OSError):  # report the first error

@@ -61,7 +61,7 @@ def _open(lock: Path) -> int:
             return os.open(lock, os.O_RDONLY | flags)
     except OSError as error:
         why = "a link, expected a file" if lock.is_symlink() else error.strerror
-        raise OutputError(f"{lock}: cannot be made ({why}); delete it, or choose another --out") from error
+        raise OutputError(f"{lock}: cannot be made ({why}); delete it, or choose another file") from error
 
 
 def _take(descriptor: int) -> bool:

@@ -19,7 +19,7 @@ from typing import Any
 
 import msgspec
 
-from modsoft.runtime.errors import UsageError
+from modsoft.runtime.errors import OutputError
 from modsoft.runtime.log_record import SCHEMA, HeaderRecord, Record, encode
 
 QUEUE_LINES = 256  # 100 s of the loop; beyond it records are dropped and counted: control has priority
@@ -97,7 +97,7 @@ class RunLog:
         calibration: str | None = None,
     ):
         """`runs`: where the folder is made; `name`: of the robot; `robot_text`: the robot file; `meta`: robot, model,
-        task and so on; `calibration`: text of the calibration file in use. Raises `UsageError` where nothing can be
+        task and so on; `calibration`: text of the calibration file in use. Raises `OutputError` where nothing can be
         written."""
         now = now or datetime.now(UTC)
         try:
@@ -109,8 +109,8 @@ class RunLog:
             self._write_meta({"exit_code": None, "reason": None})
             self._writer = Writer(self.folder / "run.jsonl")
         except OSError as error:
-            raise UsageError(
-                f"no run log can be written in {runs} ({error}); give another folder: --runs-dir"
+            raise OutputError(
+                f"no run log can be written in {runs} ({error.strerror or error}); give another folder: --runs-dir"
             ) from error
         self.put(HeaderRecord(SCHEMA))
 

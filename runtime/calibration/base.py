@@ -62,7 +62,7 @@ def frame_of(poses: Array, calibration: Calibration, planar: bool) -> Frame:
 
 
 def _unit(vector: Array) -> Array:
-    return vector / np.linalg.norm(vector)
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)  # none in a straight robot
 
 
 def aligned(frame: Frame, calibration: Calibration, planar: bool, date: str) -> Calibration:

@@ -107,3 +107,13 @@ def test_straight_robot_shows_no_frame():
     robot = Robot(2, planar=True)
     with pytest.raises(Tripped, match=r"found bends of [01]\."):
         robot.aligned([straight()] * 50)
+
+
+def test_robot_at_rest_without_any_error_shows_no_frame():
+    """Its bends are exactly 0, by which nothing is divided."""
+    exact = ERRORS._replace(**{name: 0.0 for name in ERRORS._fields if name != "seed"})
+    calibration = rest.calibrated(measured(Tracker(exact).measure(MODULES)), "arm", None)
+    with np.errstate(all="raise"):
+        frame = base.frame_of(np.tile(np.eye(4), (30, MODULES + 1, 1, 1)), calibration, True)
+    with pytest.raises(Tripped, match=r"found bends of 0\.0 degrees"):
+        base.aligned(frame, calibration, True, DATE)

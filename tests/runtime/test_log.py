@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modsoft.runtime import log as logs
-from modsoft.runtime.errors import UsageError
+from modsoft.runtime.errors import OutputError
 from modsoft.runtime.log_record import SCHEMA, encode
 
 NOW = datetime(2025, 3, 4, 5, 6, 7, tzinfo=UTC)
@@ -55,9 +55,9 @@ def test_two_runs_in_one_second(tmp_path):
     second.close(0, "done", {})
 
 
-def test_uncreatable_folder_is_usage_error(tmp_path):
+def test_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="--runs-dir"):
+    with pytest.raises(OutputError, match=r"no run log can be written in .*file \(File exists\); .*--runs-dir"):
         a_log(tmp_path / "file")
 
 

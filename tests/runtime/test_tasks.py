@@ -31,6 +31,13 @@ def test_circle_bends_turns_and_returns():
     assert "circle" not in tasks.available("spatial", 4)
 
 
+def test_three_chamber_robot_without_its_last_module_has_its_task():
+    robot = robot_file.load("pneumatic-3x3").to_dict()
+    robot["robot"]["modules"] = 2
+    shorter = robot_file.from_dict(robot)
+    assert tasks.load_task(shorter.loop.task, shorter).shape == (200, 2, 3)
+
+
 def test_task_a_starts_straight_and_keeps_bending():
     desired = tasks.task("A", "spatial", 4)
     np.testing.assert_allclose(desired[0], [[0, 0, 1]] * 4, atol=1e-12)

@@ -150,7 +150,7 @@ def _run(collection: Collection, devices: Devices, calibration: UsedCalibration 
     try:
         used = None if calibration is None else calibration.text
         log = RunLog(collection.runs.folder, robot.name, collection.robot_text, meta, calibration=used)
-    except UsageError as error:
+    except OutputError as error:
         raise OutputError(f"{error.__cause__ or error}; make room, then run the same command again") from error
     samples = Samples(robot, plan)
 
