@@ -1,9 +1,15 @@
 """modsoft-hil and the folder that it writes."""
 
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import click
 import pytest
 
 from modsoft.hil import cli, report_folder, rig
+from modsoft.runtime import robot as robot_file
 from modsoft.runtime.errors import InUse, OutputError, UsageError
 
 
@@ -115,6 +121,19 @@ def test_folder_that_cannot_be_made_is_refused(tmp_path, run_command):
     (tmp_path / "out").symlink_to("/proc/none")
     with pytest.raises(OutputError, match="out: no such folder can be made"):
         run_command()
+
+
+def test_run_without_a_control_step_shows_only_its_cause(model_file, tmp_path):
+    shipped = Path(robot_file.__file__).with_name("robots") / "pneumatic-3.toml"
+    robot = tmp_path / "robot.toml"
+    robot.write_text(shipped.read_text().replace("\nfull_scale_bar = 3.0", "\nfull_scale_bar = 2.0"))
+    command = [Path(sys.executable).with_name("modsoft-hil"), "--robot", robot, "--model", model_file, "--task", "down"]
+    done = subprocess.run(
+        [*command, "--board", "native", "--report", tmp_path / "out"], capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stdout) == (76, "")
+    message = r"no control step: modsoft-runtime: valve full scale: the board at .* has 3 bar, the robot file 2; .*\n"
+    assert re.fullmatch(message + re.escape(f"{tmp_path / 'out' / 'report.md'}\n"), done.stderr), done.stderr
 
 
 def test_help_describes_the_folder(capsys):

@@ -141,14 +141,17 @@ def cli(
     about = _about(rig, robot_file, model, task, steps, count)
     if no_picture := reports.write(run, assessment, about, report):
         click.echo(f"modsoft-hil: {no_picture}", err=True)
+    if run.runtime_exit and not len(run.tick):  # there are no figures
+        message = run.runtime_message or "modsoft-runtime gave no message"
+        click.echo(f"no control step: {message}\n{report / 'report.md'}", err=True)
+        return run.runtime_exit
     for line in [*assessment.criteria, *assessment.host_load_checks]:
         met = "--" if line.met is None else "ok" if line.met else "NO"
         click.echo(f"{met:>4}  {line.name}: {line.measured} ({line.limit})")
     if run.runtime_exit:
         click.echo(f"last line of modsoft-runtime: {run.runtime_message or 'none'}")
     click.echo(f"{assessment}\n{report / 'report.md'}")
-    # a run without a tick has no figures: its exit code is the runtime's
-    return run.runtime_exit if run.runtime_exit and not len(run.tick) else assessment.exit_code
+    return assessment.exit_code
 
 
 def _tool_errors(mounting_error: tuple[float, float], noise_deg: float, noise_mm: float, seed: int) -> ToolErrors:
