@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
+import threading
 import time
+from typing import Any
 
 import pytest
 
+from modsoft.hil.board import emulator
 from modsoft.hil.board.emulator import EmulatedBoard, is_event
 from modsoft.hil.board.stepped_port import SteppedPort
 from modsoft.runtime.board.board import Board
@@ -66,6 +70,23 @@ def test_bytes_have_the_baud_rate_that_was_set_before_them() -> None:
                 port.idle(0.0005)
         port.close()
     assert board.summary["wrong_baud"] == 4
+
+
+def test_port_is_not_closed_while_another_thread_starts_a_board(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Popen(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            closing.start()
+            time.sleep(0.05)
+            assert port._port.is_open
+            super().__init__(*arguments, **options)
+
+    with EmulatedBoard("native", stepped=True) as board:
+        port = SteppedPort(board)
+        closing = threading.Thread(target=port.close)
+        monkeypatch.setattr(emulator.subprocess, "Popen", Popen)
+        with EmulatedBoard("native", stepped=True):
+            closing.join()
+        assert not port._port.is_open
 
 
 @pytest.mark.usefixtures("simavr")

@@ -28,6 +28,9 @@ Event = dict[str, Any]
 START_TIMEOUT_S = 10.0
 RUN_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 3.0
+# A process that another thread starts has all open ports of this one, until it executes its program: a port that is
+# closed meanwhile would remain open for its board.
+process_start = threading.Lock()
 
 
 def is_event(name: str, **values: Any) -> Callable[[Event], bool]:
@@ -128,9 +131,10 @@ class EmulatedBoard:
             command += ["--bootloader", str(bootloader)] if bootloader else []
         command += self._pace
         self._stderr = tempfile.TemporaryFile()
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, start_new_session=True
-        )  # a Ctrl-C at the terminal is for the host; `stop` ends the board
+        with process_start:
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, start_new_session=True
+            )  # a Ctrl-C at the terminal is for the host; `stop` ends the board
         self._reader = threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True)
         self._reader.start()
         try:

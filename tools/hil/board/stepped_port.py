@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import serial
 
-from modsoft.hil.board.emulator import EmulatedBoard
+from modsoft.hil.board.emulator import EmulatedBoard, process_start
 
 STEP_US = 5000  # a read of the runtime's port waits 5 ms
 BUFFERED_AT_MOST = 2048  # bytes in a pseudo-terminal that no process reads; its buffer is larger
@@ -72,7 +72,8 @@ class SteppedPort:
         self._port.open()
 
     def close(self) -> None:
-        self._port.close()
+        with process_start:
+            self._port.close()
 
     def _step(self, microseconds: int) -> None:
         to_host = self._board.run(microseconds, self._from_host)["to_host"]
