@@ -149,7 +149,7 @@ def test_faults():
     device.take({"lose": [], "swap": [0, 2]})
     assert [t for _, t, _ in device.tools()] == [whole[2][1], whole[1][1], whole[0][1]]
     device.take({"swap": None, "jump": {"tool": 1, "mm": [10.0, 0, 0], "deg": 90.0}})
-    assert device.tools()[1][1].startswith("+07071+07071+00000+00000+001000")
+    assert device.tools()[1][1].startswith("+07071+00000+07071+00000+001000")
     device.take({"jump": None, "back": 5})
     device.time_s += 1.0
     assert device.tools()[0][2] == whole[0][2] + 55

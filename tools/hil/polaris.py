@@ -12,7 +12,7 @@ of these keys, and its end ends the process:
     {"freeze": true}           the same frame and number again
     {"delay_s": s}             frames and their numbers are this old
     {"back": n}                frame numbers n smaller
-    {"jump": {"tool": k, "mm": [x, y, z], "deg": d}}   tool k is moved and turned about its own x axis; null ends it
+    {"jump": {"tool": k, "mm": [x, y, z], "deg": d}}   tool k is moved and turned about its own y axis; null ends it
     {"swap": [j, k]}           two tools are swapped; null ends it
     {"corrupt": true}          a wrong checksum in every reply to TX and BX
     {"damage": {"seed": n, "rate": r, "kinds": [...]}}   bytes of replies flipped, dropped, inserted, delayed while it

@@ -25,10 +25,10 @@ def quaternion(pose: Pose) -> tuple[float, float, float, float]:
 
 
 def turned(pose: Pose, mm: list[float], deg: float) -> Pose:
-    """A pose moved by `mm` in the tracker's frame and turned about its own x axis."""
+    """A pose moved by `mm` in the tracker's frame and turned about its own y axis, as a planar module bends."""
     cos, sin = math.cos(math.radians(deg)), math.sin(math.radians(deg))
     rows = [
-        [row[0], row[1] * cos + row[2] * sin, row[2] * cos - row[1] * sin, row[3] + mm[axis]]
+        [row[0] * cos - row[2] * sin, row[1], row[2] * cos + row[0] * sin, row[3] + mm[axis]]
         for axis, row in enumerate(pose[:3])
     ]
     return [*rows, [0.0, 0.0, 0.0, 1.0]]
