@@ -21,6 +21,8 @@ from modsoft.runtime.robot import Robot
 
 if TYPE_CHECKING:
     from modsoft.hil.board.serial_board import SerialBoard
+    from modsoft.hil.criteria import Assessment
+    from modsoft.hil.record import Record
     from modsoft.hil.rig import Rig
 
 EMULATED = ("auto", "simavr", "native")
@@ -141,16 +143,21 @@ def cli(
     about = _about(rig, robot_file, model, task, steps, count)
     if no_picture := reports.write(run, assessment, about, report):
         click.echo(f"modsoft-hil: {no_picture}", err=True)
+    return _show(run, assessment, report / "report.md")
+
+
+def _show(run: Record, assessment: Assessment, page: Path) -> int:
+    """Prints the outcome of a run; returns the exit code of modsoft-hil."""
     if run.runtime_exit and not len(run.tick):  # there are no figures
         message = run.runtime_message or "modsoft-runtime gave no message"
-        click.echo(f"no control step: {message}\n{report / 'report.md'}", err=True)
+        click.echo(f"no control step: {message}\n{page}", err=True)
         return run.runtime_exit
     for line in [*assessment.criteria, *assessment.host_load_checks]:
         met = "--" if line.met is None else "ok" if line.met else "NO"
         click.echo(f"{met:>4}  {line.name}: {line.measured} ({line.limit})")
     if run.runtime_exit:
         click.echo(f"last line of modsoft-runtime: {run.runtime_message or 'none'}")
-    click.echo(f"{assessment}\n{report / 'report.md'}")
+    click.echo(f"{assessment}\n{page}")
     return assessment.exit_code
 
 
