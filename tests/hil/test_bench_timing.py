@@ -89,9 +89,10 @@ def test_oscillating_poses_have_the_given_bending_angles(latency_stages, modules
 
 
 @pytest.mark.realtime
-def test_real_run_measures_every_stage(latency, strong_model, tmp_path, monkeypatch):
+def test_real_run_measures_every_stage(latency, exported, tmp_path, monkeypatch):
+    model = exported("lively", gain=4.0)  # changes every set-point, in most ticks
     monkeypatch.setattr(latency, "MODULES", (2,))
-    options = ["--quick", "--model", str(strong_model), "--json", str(tmp_path / "f")]
+    options = ["--quick", "--model", str(model), "--json", str(tmp_path / "f")]
     monkeypatch.setattr(sys, "argv", ["latency", *options])
     with pytest.raises(SystemExit) as ended:
         latency.main()
